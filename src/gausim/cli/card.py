@@ -158,8 +158,7 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
     import gausim
     from gausim.compose.config import compose
     from gausim.core.errors import ConfigError
-    from gausim.report.gather.runs import flatten
-    from gausim.runs.defaults import with_defaults
+    from gausim.runs.defaults import flatten, with_defaults
 
     chosen = [f"{group}={run.choices[group]}" for group in _GROUPS if run.choices.get(group) not in (None, "None")]
     words = f"`gausim train {' '.join(chosen)}`" if chosen else "`gausim train`"
@@ -168,7 +167,8 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
     except ConfigError:  # a file of an earlier version
         default, words = compose("train"), "`gausim train` (its own presets are not of this version)"
     base_config = OmegaConf.to_container(default, resolve=True)
-    own, base = (dict(flatten(with_defaults(config))) for config in (run.config, base_config))
+    own, base = ({key: str(value) for key, value in flatten(with_defaults(config))}
+                 for config in (run.config, base_config))  # fmt: skip
     keys = [key for key in own if own[key] != base.get(key)] + [key for key in base if key not in own]
     rows = [(k, own.get(k, _ABSENT), base.get(k, _ABSENT)) for k in keys if not _is_one_of(k, _UNTOLD)]
     rows = [row for row in rows if {*row[1:]} != {"None", _ABSENT}]  # null and absent mean the same

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import add_data_option, add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import UPS, add_data_option, add_pin_options, command_parser, pinned_by
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         "kernels' bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
     add("--clustering", default=DEFAULT_CLUSTERING, choices=tuple(CLUSTERINGS),
         help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
-    add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
+    add("--up", choices=UPS,
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
     add("--out", metavar="PICTURE.png", type=Path,
         help="default <stem>.clusters.png, of a property OBJECT.PROPERTY.png")  # fmt: skip

@@ -20,7 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from gausim.core import GausSimError, RunError
 from gausim.io.files import read_yaml, remove_leftovers, write_durably
 from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
-from gausim.runs.defaults import with_defaults
+from gausim.runs.defaults import flatten, with_defaults
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
 
@@ -294,11 +294,5 @@ def is_free(key: str) -> bool:
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Dotted keys whose values differ between two configurations; missing keys have their defaults."""
-    first, second = dict(_flatten(with_defaults(old))), dict(_flatten(with_defaults(new)))
+    first, second = dict(flatten(with_defaults(old))), dict(flatten(with_defaults(new)))
     return [key for key in sorted({*first, *second}) if first.get(key) != second.get(key)]
-
-
-def _flatten(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    if isinstance(value, Mapping) and value:
-        return [item for k, v in value.items() for item in _flatten(v, f"{prefix}.{k}" if prefix else str(k))]
-    return [(prefix, value)]

@@ -16,6 +16,7 @@ from gausim.models.template.template import Property
 from gausim.ops.covariance import transport_covariance
 from gausim.ops.spherical_harmonics import C0
 from gausim.render.draw import SceneAppearance, deformed_appearance
+from gausim.report.pictures.kernels import unit_colors
 
 VIEW, BASE, STRAIN, SPEED, MASS = (
     "As seen from the camera (SH)", "Base colour (DC)", "Strain", "Velocity", "Mass",
@@ -120,13 +121,8 @@ def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: B
 
 
 def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
-    """Distinct colours of neighbouring indices, hues by the golden ratio; grey for -1."""
-    from matplotlib.colors import hsv_to_rgb
-
-    number = units.clamp_min(0).double().numpy()
-    hue, light = (number * 0.61803398875) % 1, 0.75 + 0.25 * ((number * 0.41421356) % 1)
-    rgb = torch.from_numpy(hsv_to_rgb(np.stack((hue, np.full_like(hue, 0.7), light), -1))).float()
-    return torch.where(units[:, None] < 0, 0.5, rgb)
+    """Distinct colours of neighbouring indices; grey for -1."""
+    return torch.where(units[:, None] < 0, 0.5, torch.from_numpy(unit_colors(units.numpy())).float())
 
 
 def _ramp(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ import yaml
 from gausim.core import RunError
 from gausim.io.files import read_yaml
 from gausim.results.summary import load_summary
+from gausim.runs.defaults import flatten
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_names
 
@@ -67,7 +68,7 @@ class RunRecord:
     def settings_besides(self, keys: tuple[str, ...]) -> dict[str, str]:
         """The settings without those of the groups ``keys``."""
         flat = flatten(self.config)
-        found = {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
+        found = {k: str(v) for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
         if INIT_FROM in found:  # the seed of the run that it started from
             found[INIT_FROM] = _SEED_FOLDER.sub("seed_*", found[INIT_FROM])
         return found
@@ -77,7 +78,8 @@ class RunRecord:
         """First twelve digits of the SHA-256 of the whole configuration, or ``?`` without one."""
         if not self.config:
             return "?"
-        return hashlib.sha256(json.dumps(dict(flatten(self.config)), sort_keys=True).encode()).hexdigest()[:_DIGITS]
+        flat = {key: str(value) for key, value in flatten(self.config)}
+        return hashlib.sha256(json.dumps(flat, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
     @property
     def config_text(self) -> str:
@@ -124,15 +126,6 @@ def dig(node: Any, *keys: str) -> Any:
     for key in keys:
         node = node.get(key) if isinstance(node, dict) else None
     return node
-
-
-def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted keys and values as text of nested mappings."""
-    if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from flatten(inner, f"{prefix}.{key}" if prefix else str(key))
-    else:
-        yield prefix, str(value)
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:

@@ -361,6 +361,22 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
     return Cell(value, EVALUATED, tuple(run for run, _, _ in valid))
 
 
+def effect(full: Value | None, value: Value | None) -> tuple[float, float | None] | None:
+    """Change of a mean against the full model's [%], and in standard errors over seeds where both have several."""
+    if full is None or value is None or not full.mean:
+        return None
+    change, spread = value.mean - full.mean, 0.0
+    if full.seed_std is not None and value.seed_std is not None:
+        spread = (full.seed_std**2 / full.seeds + value.seed_std**2 / value.seeds) ** 0.5
+    return 100 * change / full.mean, change / spread if spread else None
+
+
+def families(groups: Sequence[Group]) -> dict[str, list[Group]]:
+    """The rows of every model that has several variations, the full model first."""
+    found = {name: [g for g in groups if g.family == name] for name in dict.fromkeys(g.family for g in groups)}
+    return {name: sorted(own, key=lambda g: g.variation != FULL) for name, own in found.items() if len(own) > 1}
+
+
 def deviation(values: Sequence[float]) -> float | None:
     """Sample standard deviation (n - 1); None for fewer than two."""
     return statistics.stdev(values) if len(values) > 1 else None

@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled, says
+from gausim.report.gather.study import FULL, Group, Study, cell, deviation, effect, families, number, pooled, says
 from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row, value_of
@@ -124,10 +124,8 @@ def _tables(study: Study, name: str) -> Iterator[RecordTable]:
 
 def _ablations(study: Study, name: str) -> Iterator[RecordTable]:
     """Per model with several variations: figures, and the change of l2 in unseen frames against the full model."""
-    about = [group for group in study.groups if group.entries(name)]
-    for family in dict.fromkeys(group.family for group in about):
-        groups = sorted((g for g in about if g.family == family), key=lambda g: g.variation != FULL)
-        if len(groups) < 2 or groups[0].variation != FULL or "unseen" not in study.splits(name):
+    for family, groups in families([group for group in study.groups if group.entries(name)]).items():
+        if groups[0].variation != FULL or "unseen" not in study.splits(name):
             continue
         keys = [key for key in _ABLATED if study.info(key[0])]
         rows = [Row([g.variation], [_figure(g, name, s, m, v, row=None) for m, v, s in keys]) for g in groups]
@@ -142,13 +140,8 @@ def _ablations(study: Study, name: str) -> Iterator[RecordTable]:
 def _effect(full: Group, group: Group, name: str) -> list[Cell]:
     """Change of l2 in unseen frames against the full model, in per cent and in standard errors over seeds."""
     a, b = (cell(g, name, "unseen", "train", "l2").value for g in (full, group))
-    if full is group or a is None or b is None or not a.mean:
-        return [None, None]
-    change = b.mean - a.mean
-    spread = None
-    if a.seed_std is not None and b.seed_std is not None:
-        spread = (a.seed_std**2 / a.seeds + b.seed_std**2 / b.seeds) ** 0.5
-    return [_rounded(100 * change / a.mean), _rounded(change / spread) if spread else None]
+    found = None if full is group else effect(a, b)
+    return [None if value is None else _rounded(value) for value in found or (None, None)]
 
 
 def _frames(split: str, splits: dict[str, Sequence[int]]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from gausim.report.gather import paper
 from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, number
+from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, effect, families, number
 from gausim.report.tables.motion import bounce_sheets, diagnosis_sheets, horizon_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
@@ -56,11 +56,8 @@ def ablation_sheets(study: Study) -> list[Sheet]:
     """One table per object and model with several variations; columns are variations, as in the paper."""
     sheets = []
     for name in study.objects:
-        about = [group for group in study.groups if name in group.objects]
-        for family in dict.fromkeys(group.family for group in about):
-            groups = sorted((g for g in about if g.family == family), key=lambda g: g.variation != FULL)
-            if len(groups) > 1 and study.splits(name):
-                sheets.append(_ablation(study, name, family, groups))
+        about = families([group for group in study.groups if name in group.objects] if study.splits(name) else [])
+        sheets += [_ablation(study, name, family, groups) for family, groups in about.items()]
     return sheets
 
 
@@ -94,16 +91,14 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
 
 def _against_full(cells: Sequence[Cell], title: str) -> Line:
     """Relative change of the error against the first column."""
-    full, entries = cells[0].value, [plain("")]
+    entries = [plain("")]
     for c in cells[1:]:
-        if full is None or c.value is None or not full.mean:
+        found = effect(cells[0].value, c.value)
+        if found is None:
             entries.append(plain(""))
             continue
-        change, extra = c.value.mean - full.mean, ""
-        if full.seed_std is not None and c.value.seed_std is not None:
-            spread = (full.seed_std**2 / full.seeds + c.value.seed_std**2 / c.value.seeds) ** 0.5
-            extra = f"{change / spread:+.1f} σ" if spread else ""
-        entries.append(Entry(f"{100 * change / full.mean:+.1f} %", extra, runs=cells[0].runs + c.runs))
+        extra = "" if found[1] is None else f"{found[1]:+.1f} σ"
+        entries.append(Entry(f"{found[0]:+.1f} %", extra, runs=cells[0].runs + c.runs))
     return Line(f"l2: {title}, against full", METHOD, tuple(entries))
 
 
