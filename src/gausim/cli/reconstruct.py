@@ -13,9 +13,6 @@ from gausim.cli.bars import bars
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from torch import Tensor
-
     from gausim.core import GaussianScene, Renderer
     from gausim.reconstruction.reconstruction import ReconstructionOptions
     from gausim.reconstruction.splat_start import PointCloud
@@ -26,8 +23,6 @@ if TYPE_CHECKING:
 # Images side by side in the comparison picture.
 COMPARED = 5
 LEFT_OUT_COMPARED = 2
-# Largest width of each of them [pixels].
-COLUMN = 480
 # Number of intermediate saves during the reconstruction of a scene.
 SAVES = 20
 # An open scene has parts of all sizes that occlude each other, and grows from few points.
@@ -233,36 +228,23 @@ def _fit(
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
     """Draws truth, rendering and four times the difference (rows) of held-out and then training stills (columns)."""
-    import torch
-
-    from gausim.data.images import composite, write_rgba
+    from gausim.data.images import composite
     from gausim.reconstruction.stills import draw_rest
+    from gausim.render.draw import to_bytes
+    from gausim.report.pictures.figures import picture_grid
 
     size = sets[0].cameras.width, sets[0].cameras.height
     alike = [s for s in sets if (s.cameras.width, s.cameras.height) == size]
     counts = (LEFT_OUT_COMPARED, COMPARED - LEFT_OUT_COMPARED) if len(alike) > 1 else (COMPARED,)
-    columns = []
+    rows: dict[str, list[Any]] = {"truth": [], "rendering": [], "4 x difference": []}
     for images, count in zip(alike, counts, strict=False):
         total = len(images.images)
         chosen = images.select(sorted({i * total // count for i in range(count)}))
-        truth, _ = composite(chosen.images)
-        drawn = draw_rest(scene, renderer, chosen.cameras)
-        columns += [
-            _small(torch.cat(x)) for x in zip(truth, drawn, (4 * (drawn - truth).abs()).clamp(0, 1), strict=True)
-        ]
-    rgb = torch.cat(columns, dim=1)
-    pixels = (torch.cat((rgb, torch.ones_like(rgb[..., :1])), -1) * 255).round().to(torch.uint8)
-    write_rgba(path, pixels)
-
-
-def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
-    """Reduces an image to at most :data:`COLUMN` pixels in width, as a picture of full photos would be too large."""
-    height, width = image.shape[:2]
-    if width <= COLUMN:
-        return image
-    from torch.nn.functional import adaptive_avg_pool2d
-
-    return adaptive_avg_pool2d(image.permute(2, 0, 1), (round(height * COLUMN / width), COLUMN)).permute(1, 2, 0)
+        truth, drawn = composite(chosen.images)[0], draw_rest(scene, renderer, chosen.cameras)
+        for row, pictures in zip(rows.values(), (truth, drawn, 4 * (drawn - truth).abs()), strict=True):
+            row += [to_bytes(picture).numpy() for picture in pictures]
+    labels = [label for label, row in rows.items() for _ in row]
+    picture_grid(sum(rows.values(), []), labels, path, title=scene.name, columns=len(rows["truth"]))
 
 
 def _told(record: dict, out: Path, seconds: float) -> str:
