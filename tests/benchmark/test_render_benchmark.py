@@ -7,10 +7,9 @@ import torch
 
 from gausim.benchmark import render
 from gausim.benchmark.harness import Options
-from gausim.benchmark.splats import deformed, gradients, splats, without_graph
+from gausim.benchmark.splats import splats
 from gausim.render import gsplat
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
 QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
@@ -23,8 +22,7 @@ def test_every_figure_is_reported(first_call: bool, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(render, "SHORT_CALLS", 0.0)
     monkeypatch.setattr(render, "QUICK_CASES", ((100, 20), (150, 24)))
     if not first_call:
-        measured = {"renderer": 1.0, "appearance": 1.0, "memory": 1.0, "imports": 1.0}
-        monkeypatch.setattr(render, "in_fresh_process", lambda count, size, cache: measured)
+        monkeypatch.setattr(render, "in_fresh_process", lambda count, size, cache: 1.0)
     rows = render.run(QUICK)
     found = {(row.case, row.metric): row.value for row in rows}
     assert len(found) == len(rows) and all(value > 0 for value in found.values())
@@ -33,12 +31,10 @@ def test_every_figure_is_reported(first_call: bool, monkeypatch: pytest.MonkeyPa
         for metric in ("forward", "forward + backward"):
             ratio = found[name, f"{metric}, plain torch"] / found[name, metric]
             assert found[name, f"plain torch / {metric}"] == pytest.approx(ratio)
-        assert {(name, part) for part in render.PARTS} <= set(found)
     threads = [case for case, metric in found if metric == "one thread / two threads"]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert len(threads) == (4 if cores and cores > 1 else 0)
-    first = [metric for case, metric in found if case.startswith("first call")]
-    assert len(first) == 6 and "renderer, compiles" in first and "colours and covariances, cached" in first
+    assert [metric for case, metric in found if case.startswith("first call")] == ["compiles", "cached"]
 
 
 def test_a_gpu_that_cannot_be_used_is_reported(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -55,8 +51,3 @@ def test_both_sides_of_every_ratio_compute_the_same() -> None:
     found, expected = (scene.both(renderer, scene.weights()) for renderer in (CpuRenderer(), ReferenceRenderer()))
     for value, truth in zip(found, expected, strict=True):
         assert float((value - truth).norm() / truth.norm()) < 1e-2
-    state = deformed(50, 6, 3, 2)
-    for call in (without_graph, gradients):
-        pair = (call(form, state) for form in (deformed_appearance.fast, deformed_appearance.plain))
-        for value, truth in zip(*pair, strict=True):
-            torch.testing.assert_close(value, truth, rtol=1e-4, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Benchmark of rendering: CPU renderer against plain torch; its parts, threads, compilation and memory."""
+"""Benchmark of rendering: CPU renderer against plain torch; threads, views and compilation."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from functools import partial
 import torch
 
 from gausim.benchmark.first_call import in_fresh_process
-from gausim.benchmark.harness import Options, Row, medians, spent_in, torch_threads
-from gausim.benchmark.splats import Splats, deformed, gradients, splats, without_graph
+from gausim.benchmark.harness import Options, Row, medians, torch_threads
+from gausim.benchmark.splats import Splats, splats
 from gausim.core import Renderer
 from gausim.render import gsplat
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.batch import Batch
-from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
 # Kernels and edge of the square image [pixels].
@@ -25,18 +23,9 @@ CASES = tuple((count, size) for count in (5_000, 23_000) for size in (128, 256, 
 QUICK_CASES = ((300, 40), (500, 64), (500, 72))
 PAPER = (23_422, 960, 540)  # kernels, width and height of the paper's scene
 VIEWS = 4
-UNITS, SH_DEGREE = 1_203, 3
 TORCH = "render=reference: plain torch in tiles, float32, one thread, same run"
 # Calls shorter than this are timed several in a row, as in training, where a call of the renderer follows others.
 SHORT_CALLS = 0.02  # [s]
-PARTS = {
-    "projection": "project",
-    "order by depth": "sort",
-    "binning": "bin",
-    "compositing": "composite",
-    "compositing, backward": "composite_adjoint",
-    "projection, backward": "project_adjoint",
-}
 
 
 def run(options: Options) -> list[Row]:
@@ -48,8 +37,8 @@ def run(options: Options) -> list[Row]:
     with torch_threads(1):
         for count, size in cases:
             scene, name = splats(count, size, size), _name(count, size)
-            rows += _against_torch(name, scene, options) + _parts(name, scene, options)
-        rows += _threads(cases, options) + _appearance(cases[-1][0], options)
+            rows += _against_torch(name, scene, options)
+        rows += _threads(cases, options)
     return rows + _first_call(*cases[-1])
 
 
@@ -72,15 +61,6 @@ def _against_torch(name: str, scene: Splats, options: Options) -> list[Row]:
     return rows
 
 
-def _parts(name: str, scene: Splats, options: Options) -> list[Row]:
-    """Times of the renderer's parts."""
-    renderer, weights = CpuRenderer(threads=1), scene.weights()
-    with spent_in({part: [(Batch, method)] for part, method in PARTS.items()}, options.device) as seconds:
-        for _ in range(options.rounds):
-            scene.both(renderer, weights)
-    return [Row(name, part, 1e3 * spent / options.rounds, "ms") for part, spent in seconds.items()]
-
-
 def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
     """Two threads against one, for one view and for several in one call."""
     if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) < 2:
@@ -99,32 +79,14 @@ def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
     return rows
 
 
-def _appearance(count: int, options: Options) -> list[Row]:
-    """Colours and covariances of deformed kernels, the inputs of rendering."""
-    state = deformed(count, UNITS, VIEWS, SH_DEGREE)
-    name = f"colours and covariances, {count} kernels, {VIEWS} views, degree {SH_DEGREE}"
-    rows = []
-    for metric, call in (("forward", without_graph), ("forward + backward", gradients)):
-        forms = {"own": deformed_appearance.fast, "torch": deformed_appearance.plain}
-        calls = {form: partial(call, function, state) for form, function in forms.items()}
-        times = medians(calls, options, warmup=2, at_least=SHORT_CALLS)
-        rows.append(Row(name, metric, 1e3 * times["own"], "ms"))
-        text = "the torch form, one thread, same run"
-        rows.append(Row(name, f"plain torch / {metric}", times["torch"] / times["own"], "x", text))
-    return rows
-
-
 def _first_call(count: int, size: int) -> list[Row]:
     """First calls in new processes, with an empty and with a filled cache of compiled code."""
-    rows, name = [], f"first call, {count} kernels, {size} x {size}"
+    name, text = (
+        f"first call, {count} kernels, {size} x {size}",
+        "forward + backward in a new process, beyond its imports",
+    )
     with tempfile.TemporaryDirectory() as cache:
-        for state in ("compiles", "cached"):
-            found = in_fresh_process(count, size, cache)
-            text = "forward + backward in a new process, beyond its imports"
-            rows.append(Row(name, f"renderer, {state}", found["renderer"], "s", text))
-            rows.append(Row(name, f"colours and covariances, {state}", found["appearance"], "s", text))
-    rows.append(Row(name, "process memory", found["memory"], "B", "largest resident set, one image forward + backward"))
-    return [*rows, Row(name, "process memory, imports alone", found["imports"], "B", "before the first call")]
+        return [Row(name, s, in_fresh_process(count, size, cache), "s", text) for s in ("compiles", "cached")]
 
 
 def _gsplat(options: Options) -> list[Row]:

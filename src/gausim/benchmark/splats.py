@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import GaussianScene, Rendered, Renderer
+from gausim.core import Rendered, Renderer
 from gausim.ops.covariance import covariance_from_scales
-from gausim.ops.deformation import polar_rotation
-from gausim.render.draw import SceneAppearance
 
 SPREAD = 0.4  # standard deviation of the means [scene units]
 DISTANCE = 2.5  # of the cameras from the centre [scene units]
@@ -87,39 +84,3 @@ def splats(count: int, width: int, height: int, views: int = 1) -> Splats:
         Ks=intrinsics.repeat(1, views, 1, 1),
         size=(width, height),
     )
-
-
-def deformed(count: int, units: int, views: int, degree: int) -> tuple[Tensor, ...]:
-    """Arguments of :func:`gausim.render.draw.deformed_appearance` for random kernels.
-
-    Deformation gradients are near the identity; colours are spherical harmonics of degree ``degree``.
-    """
-    g = torch.Generator().manual_seed(0)
-    deformation_gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
-    scene = GaussianScene.create(
-        means=SPREAD * torch.randn(count, 3, generator=g),
-        log_scales=0.5 * torch.randn(count, 3, generator=g) + math.log(0.5 / count**0.5),
-        quats=torch.randn(count, 4, generator=g),
-        opacity_logits=torch.randn(count, generator=g),
-        sh=0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
-    )
-    look, centers = SceneAppearance.of(scene), torch.randn(views, 3, generator=g)
-    centers = DISTANCE * torch.nn.functional.normalize(centers, dim=-1)
-    unit, rotations = torch.randint(0, units, (count,), generator=g), polar_rotation(deformation_gradients)
-    return scene.means[None], deformation_gradients, rotations, unit, look.covars, look.sh, centers
-
-
-Form = Callable[..., tuple[Tensor, ...]]
-
-
-@torch.no_grad()
-def without_graph(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Result of a form for a deformed state, without a graph."""
-    return form(*state)
-
-
-def gradients(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Gradients of a form's results with respect to positions, deformation gradients and rotations."""
-    leaves = [value.detach().requires_grad_() for value in state[:3]]
-    outputs = form(*leaves, *state[3:])
-    return torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])

@@ -55,10 +55,6 @@ class _Case:
     def steps(self) -> int:
         return self.samples[0].steps
 
-    def shortened(self, steps: int) -> _Case:
-        samples = [replace(s, frames=s.frames[: steps + 1]) for s in self.samples]
-        return _Case(self.module, samples, self.optimizer)
-
     def step(self, *, static: bool = False) -> None:
         """One optimiser step with or without the static loss, which only some batches have."""
         own = self.module.objective
@@ -136,12 +132,7 @@ def _parts(case: _Case, options: Options) -> dict[str, float]:
 
 
 def _memory(name: str, case: _Case, options: Options) -> list[Row]:
-    held = peak_saved_bytes(case.step)
-    rows = [Row(name, "held for the backward pass, at most", held / 2**20, "MiB")]
-    if case.steps > 1:
-        fewer = case.steps // 2
-        grown = (held - peak_saved_bytes(case.shortened(fewer).step)) / (case.steps - fewer) / 2**20
-        rows.append(Row(name, "held for each further predicted frame", grown, "MiB"))
+    rows = [Row(name, "held for the backward pass, at most", peak_saved_bytes(case.step) / 2**20, "MiB")]
     if options.device.type == "cuda":
         rows.append(Row(name, "device memory, at most", torch.cuda.max_memory_allocated(options.device) / 2**20, "MiB"))
     return [*rows, Row(name, "process memory, at most", peak_resident() / 2**20, "MiB")]

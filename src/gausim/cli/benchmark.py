@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gausim.models.step.simulator import GausSim
 
 CASES = {
-    "render": "the CPU renderer against plain torch; its parts, threads, views, compilation",
+    "render": "the CPU renderer against plain torch, threads, views, compilation",
     "step": "one predicted frame at the paper's size, with and without hierarchy",
     "train": "whole optimiser steps, part by part, against elastic ones; KEY=VALUE as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
@@ -133,7 +133,7 @@ def _readable(value: float, unit: str) -> tuple[str, str]:
     """A figure with three significant digits, and its unit with an SI prefix if it takes one."""
     if unit == "s" and value < 1:
         return f"{1000 * value:.3g}", "ms"
-    if unit in ("B", "FLOP/s", "B/s"):
+    if unit == "B":
         for power, prefix in ((9, "G"), (6, "M"), (3, "k")):
             if value >= 10**power:
                 return f"{value / 10**power:.3g}", prefix + unit
