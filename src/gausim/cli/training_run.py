@@ -84,14 +84,7 @@ def _evaluate(run: RunDirectory) -> None:
     if getattr(rank_zero_only, "rank", 0):
         return
     part = (run.config().get("protocol") or {}).get("part")
-    command = [
-        sys.executable,
-        "-m",
-        "gausim.cli.main",
-        "evaluate",
-        str(run.path),
-        *(["--test"] if part == "test" else []),
-    ]
+    command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path), *["--test"] * (part == "test")]
     status = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}).returncode
     if status:
         raise RunError(

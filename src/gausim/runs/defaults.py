@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import json
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 OURS = "gausim."
@@ -32,8 +33,8 @@ def _defaults(target: Any) -> Iterator[tuple[str, Any]]:
     except (ImportError, AttributeError, TypeError, ValueError):
         return  # building the node reports the error
     for name, parameter in parameters.items():
-        if parameter.default not in (None, inspect.Parameter.empty) and _is_plain(parameter.default):
-            yield name, _plain(parameter.default)
+        if (default := _plain(parameter.default)) not in (None, [], {}):
+            yield name, default
 
 
 def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -45,15 +46,9 @@ def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield prefix, value
 
 
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return all(_is_plain(child) for child in value.values())
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return bool(value) and all(_is_plain(child) for child in value)
-    return isinstance(value, bool | int | float | str)
-
-
 def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(child) for key, child in value.items()}
-    return [_plain(child) for child in value] if isinstance(value, list | tuple) else value
+    """The value as JSON holds it; None for what JSON does not know."""
+    try:
+        return json.loads(json.dumps(value))
+    except (TypeError, ValueError):
+        return None

@@ -23,7 +23,6 @@ from gausim.core import RunError
 from gausim.io.files import write_durably
 
 SCHEMA = "gausim.record/1"
-BEFORE_RECORDS = "before records existed"
 
 
 class Figure(msgspec.Struct, omit_defaults=True, forbid_unknown_fields=True):
