@@ -224,7 +224,7 @@ def _figure(group: Group, name: str, split: str, metric: str, views: str, *, row
     key = "pooled" if metric == MOTION_ENERGY else "mean"
     own = [dig(find(entry), key) for _, entry in group.entries(name)]
     infos = (entry["metrics"][metric] for _, entry in group.entries(name) if metric in entry["metrics"])
-    scale = 1.0 if metric == ERROR_3D else next(infos)["scale"]
+    scale = 1.0 if metric == ERROR_3D else next(infos, {"scale": 1.0})["scale"]
     seeds = [_rounded(v * scale) for v in own if v is not None]
     if row is not None:
         seeds = seeds[:1]  # references do not depend on seeds
