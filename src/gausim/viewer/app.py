@@ -132,7 +132,7 @@ class Viewer:
 
     @torch.no_grad()
     def _paint_now(self, shown: Shown) -> _Painted:
-        legend, buffer = self._packed(self._painter, self.placing, shown, highlight=self.page.highlight)
+        legend, buffer = self._packed(self._painter, self.placing, shown, highlight=True)
         beside = None
         if shown.beside is not None:
             _, beside = self._packed(self._other_painter, self._other_placing, shown.beside)

@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from viser.transforms import SO3
 
 from gausim.core import Cameras, GausSimError
 from gausim.interaction.words import parse_direction
@@ -28,7 +27,7 @@ _APART = 1.25
 
 
 class CameraPanel:
-    """The cameras of one viewer, their frustums and the panel of videos, if the subject has any.
+    """The cameras of one viewer and the panel of videos, if the subject has any.
 
     Attributes:
         up: vertical direction.
@@ -53,7 +52,6 @@ class CameraPanel:
         camera.position, camera.look_at, camera.up = self.first_position, target, self.up
         camera.fov = fov
         self._drawn = 0.0
-        self._frustums: list[Any] = []
         if self._cameras is not None:
             self._add_cameras(self._cameras)
         if self._films is not None:
@@ -70,47 +68,34 @@ class CameraPanel:
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position, target and vertical field of view of the initial view."""
         if self._cameras is not None:
-            position, _, forward, _, fov = self._pose(self._cameras, 0)
+            position, forward, _, fov = self._pose(self._cameras, 0)
             return position, position + forward * max(float(-position @ forward), 0.1), fov
         side = np.array([1.0, 0.0, 0.0]) if abs(self.up[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
         away = np.cross(side, self.up)
         return 1.5 * SIZE * (0.35 * side - away + 0.35 * self.up) / 1.12, np.zeros(3), _HEIGHT_OF_VIEW
 
-    def _pose(self, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Position on the page, quaternion w x y z, forward, up and vertical field of view of a camera."""
+    def _pose(self, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Position on the page, forward, up and vertical field of view of a camera."""
         view = cameras.viewmats[index].double().cpu()
         rotation = view[:3, :3].T.numpy()
         position = self._placing.to_page(cameras.centers[index].float().cpu()).double().numpy()
         fov = 2 * math.atan(cameras.height / 2 / float(cameras.Ks[index, 1, 1]))
-        return position, SO3.from_matrix(rotation).wxyz, rotation[:, 2], -rotation[:, 1], fov
+        return position, rotation[:, 2], -rotation[:, 1], fov
 
     def _add_cameras(self, cameras: Cameras) -> None:
         gui = self._server.gui
         with gui.add_folder("Cameras of the data set", expand_by_default=False):
             choice = gui.add_dropdown("Look from", (_FREE, *cameras.names), initial_value=_FREE)
-            frustums = gui.add_checkbox("Show them", False)
-        for index in range(len(cameras.names)):
-            position, wxyz, _, _, fov = self._pose(cameras, index)
-            self._frustums.append(self._server.scene.add_camera_frustum(
-                f"/cameras/{index}", fov=fov, aspect=cameras.width / cameras.height, scale=0.12 * SIZE, wxyz=wxyz,
-                position=position, color=(60, 110, 200), visible=False,
-            ))  # fmt: skip
 
         async def chosen(event: Any) -> None:
             if event.client is not None and choice.value in cameras.names:
                 self.look_from(event.client, cameras, cameras.names.index(choice.value))
 
-        async def switched(event: Any) -> None:
-            if event.client is not None:
-                for frustum in self._frustums:
-                    frustum.visible = bool(frustums.value)
-
         choice.on_update(chosen)
-        frustums.on_update(switched)
 
     def look_from(self, client: Any, cameras: Cameras, index: int) -> None:
         """Moves the view of one browser to a camera of the data set."""
-        position, _, forward, up, fov = self._pose(cameras, index)
+        position, forward, up, fov = self._pose(cameras, index)
         with client.atomic():
             client.camera.up_direction = up
             client.camera.position = position

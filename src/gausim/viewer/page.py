@@ -44,7 +44,6 @@ class Page:
 
     Attributes:
         mode: colour mode of the kernels.
-        highlight: whether the selection is shown in orange.
         saved: paths of the saved sessions, in order.
     """
 
@@ -64,7 +63,7 @@ class Page:
         """Builds the panel; ``down`` is the initial direction of gravity, ``sessions`` the folder of saved sessions."""
         self._live, self._pointer, self._sessions = live, pointer, sessions
         self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
-        self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
+        self.mode, self.saved = VIEW, list[Path]()
         self._refreshed, self._modes = 0.0, modes
         gui = server.gui
         self._status = gui.add_html("")
@@ -168,9 +167,6 @@ class Page:
         choice = gui.add_dropdown("Colours", self._modes, initial_value=self.mode)
         self._on_change(choice, self._modes, self._recolour)
         self._legend = gui.add_html("")
-        handles = gui.add_checkbox("Show the handles", False, hint="What is picked: one per part")
-        self._on_change(handles, (False, True), self._pointer.show_handles)
-        self._on_change(gui.add_checkbox("Selection in orange", True), (False, True), self._mark)
 
     def _session_tab(self, gui: Any) -> None:
         gui.add_html(_small("Everything done to the object is recorded and can be replayed bit for bit."))
@@ -202,7 +198,7 @@ class Page:
             if event.client is None:
                 return  # set by this program
             value = handle.value
-            if any(isinstance(item, str | bool) for item in known):
+            if isinstance(known[0], str):
                 right = value in known
             else:
                 right = isinstance(value, int | float) and not isinstance(value, bool) and known[0] <= value <= known[1]
@@ -255,10 +251,6 @@ class Page:
     def _recolour(self, mode: str) -> None:
         self.mode = mode
         self._forget_scales()
-        self._repaint()
-
-    def _mark(self, on: bool) -> None:
-        self.highlight = on
         self._repaint()
 
     def _selected(self) -> None:

@@ -56,7 +56,7 @@ class Pointer:
         self._pins = pin_groups(self._hand, units[0].cpu() if units else torch.zeros_like(self._hand))
         self._grabs: dict[int, Grab] = {}  # by client
         self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
-        self._shown_handles, self._moved = False, 0.0
+        self._moved = 0.0
         self._pick: Any = None
         self._lock = threading.Lock()
         self._page: Tensor | None = None
@@ -118,19 +118,9 @@ class Pointer:
             "/handles", invisible_handle(), np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)), centres,
             batched_scales=radii, lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        self._dots = self._server.scene.add_point_cloud(
-            "/dots", centres, (255, 120, 0), point_size=0.012 * SIZE, point_shape="circle",
-            visible=self._shown_handles,
-        )  # fmt: skip
         # Clicks are resolved by their ray, not by handles, as viser would outline clickable handles.
         self._pick.on_drag("left")(self._dragged)
         self._pick.on_drag("left", modifier="cmd/ctrl")(self._flicked)
-
-    def show_handles(self, visible: bool) -> None:
-        """Shows or hides the handles' centres."""
-        self._shown_handles = visible
-        with self._lock:
-            self._dots.visible = visible
 
     def follow(self, shown: Shown) -> None:
         """Moves the handles to the current centres of their units."""
@@ -140,9 +130,7 @@ class Pointer:
             return
         self._moved = now
         with self._lock:
-            self._pick.batched_positions = centres = self._centres(shown.frame.positions).numpy()
-            if self._shown_handles:
-                self._dots.points = centres
+            self._pick.batched_positions = self._centres(shown.frame.positions).numpy()
 
     def select(self, on: Selected | None) -> None:
         """Selects a part, or none."""
