@@ -36,7 +36,7 @@ def test_a_good_object_has_no_fault_and_no_warning_and_a_page(
     assert found(entry) == {}
     page = (out / "index.html").read_text()
     assert "nothing is wrong (4 cameras, 4 sequences" in page
-    for name in ("views.png", "motion.png", "spectrum.png", "coverage.png"):
+    for name in ("views.png", "motion.png"):
         picture = cv2.imread(str(out / name))
         assert f'src="{name}"' in page and picture.std() > 5
     orange = cv2.imread(str(out / "views.png"))[..., ::-1].astype(int)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -131,31 +130,20 @@ def _first_overlaps(evidence: Evidence) -> dict[str, float]:
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class Swing:
-    """Oscillation of the object, estimated from the images."""
-
-    frequency: np.ndarray  # of the spectrum [Hz]
-    power: np.ndarray  # of the spectrum, 1 at its peak
-    dominant: float  # frequency of the peak [Hz]
-    cycles: float  # of the dominant frequency within the examined frames; more than one is needed
-
-
-def swing(evidence: Evidence) -> Swing:
-    """Frequency of the largest change of the images, over all views.
+def swing(evidence: Evidence) -> tuple[float, float]:
+    """Frequency of the largest change of the images over all views [Hz], and its cycles within the examined frames.
 
     Images stand for displacements: their largest change is a fixed pattern times a coordinate that oscillates with the
-    object, while the displacement is smaller than the object's width.
+    object, while the displacement is smaller than the object's width. More than one cycle is needed.
     """
     motions = [_pattern(item) for item in evidence.watched if len(item.gray) > 3]
     if not motions:
-        return Swing(np.zeros(1), np.zeros(1), 0.0, 0.0)
+        return 0.0, 0.0
     shapes, _ = principal_motions(motions, _MOTIONS)
     series = [coordinates(motion, shapes) for motion in motions]
     frequency, power = spectrum(series, evidence.data.fps)
     dominant = float(frequency[1:][power[1:].argmax()])  # without the constant part
-    seconds = min(len(s) for s in series) / evidence.data.fps
-    return Swing(frequency, power / max(float(power.max()), 1e-30), dominant, dominant * seconds)
+    return dominant, dominant * min(len(s) for s in series) / evidence.data.fps
 
 
 def _pattern(item: Watched) -> np.ndarray:
@@ -170,24 +158,24 @@ def _pattern(item: Watched) -> np.ndarray:
 
 
 def _rates(evidence: Evidence) -> Iterator[Finding]:
-    fps, found = evidence.data.fps, swing(evidence)
-    measured = {"frequency": found.dominant, "cycles": found.cycles, "fps": fps}
-    swings = found.cycles >= _CYCLES
-    pace = found.dominant / fps  # cycles per frame
+    fps, (dominant, cycles) = evidence.data.fps, swing(evidence)
+    measured = {"frequency": dominant, "cycles": cycles, "fps": fps}
+    swings = cycles >= _CYCLES
+    pace = dominant / fps  # cycles per frame
     if swings and pace > _FAST:
         yield Finding(
             "fault" if pace > _TOO_FAST else "warning", "likely",
-            f"The object swings at about {found.dominant:.2g} Hz, once in {1 / pace:.1f} frames at {fps:g} frames per "
+            f"The object swings at about {dominant:.2g} Hz, once in {1 / pace:.1f} frames at {fps:g} frames per "
             "second: that is too fast for steps of a frame.",
             "Film at a higher rate (five frames per swing or more), or keep every frame of the film.", measured,
         )  # fmt: skip
     usual = any(abs(fps / rate - 1) < _RATE_TOLERANCE for rate in _USUAL_RATES)
-    plausible = not swings or _SLOWEST <= found.dominant <= _FASTEST
+    plausible = not swings or _SLOWEST <= dominant <= _FASTEST
     if usual and plausible:
         if swings:
             yield Finding(
                 "note", "likely",
-                f"The object swings at about {found.dominant:.2g} Hz, once in {fps / found.dominant:.0f} frames at "
+                f"The object swings at about {dominant:.2g} Hz, once in {fps / dominant:.0f} frames at "
                 f"{fps:g} frames per second.",
                 "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.", measured,
             )  # fmt: skip
@@ -195,8 +183,8 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     reason = f"{fps:g} frames per second is no usual rate of a camera" if not usual else ""
     if swings:
         reason += f"{' and' if reason else 'At ' + format(fps, 'g') + ' frames per second'} the object would swing at "
-        reason += f"{found.dominant:.2g} Hz"
-    others = ", ".join(f"{found.dominant * rate / fps:.2g} Hz at {rate}" for rate in (24, 30, 60, 120, 240))
+        reason += f"{dominant:.2g} Hz"
+    others = ", ".join(f"{dominant * rate / fps:.2g} Hz at {rate}" for rate in (24, 30, 60, 120, 240))
     check = f" By a stopwatch: it would be {others}." if swings else ""
     yield Finding(
         "warning", "possible" if plausible else "likely",
