@@ -168,11 +168,12 @@ def test_why_there_is_no_number(sweep):
     assert cell(groups[0], "toy_bunny", "seen", "train", "flip").status == "not measured"
 
 
-def test_what_makes_seeds_incomparable_is_noted(tmp_path):
+def test_what_makes_runs_incomparable_is_noted(tmp_path):
     evaluate(write_run(tmp_path / "a", config(0)), make_curves(1.0))
     evaluate(write_run(tmp_path / "b", config(1)), make_curves(1.0, frames=40))
     evaluate(write_run(tmp_path / "c", config(1)), make_curves(1.0))
     write_run(tmp_path / "d", config(2))
     notes = "\n".join(make_study(find_runs([tmp_path])).notes)
-    assert "different ranges of frames" in notes and "seed 1 is there more than once" in notes
+    assert "toy_bunny: runs were evaluated on different ranges of frames and cannot be compared, as c, b." in notes
+    assert "seed 1 is there more than once" in notes
     assert "1 of 4 runs have no numbers" in notes

@@ -127,13 +127,6 @@ def test_the_efficiency_table(sweep):
     assert rows["GausSim w/o hierarchy (paper)"][2] == "0.36"
 
 
-def test_references_that_differ_between_runs_are_rows_of_their_own(tmp_path):
-    evaluate(write_run(tmp_path / "a", config()), make_curves(1.0))
-    evaluate(write_run(tmp_path / "b", config(name="b")), make_curves(1.0, static=5.0))
-    rows = texts(sheets(tmp_path)["l2_train"])
-    assert rows["static"][0] == "8.00 ± 4.00" and rows["static [2]"][0] == "10.00 ± 5.00"
-
-
 def test_the_papers_own_figures():
     assert paper_object("bunny_ready") == "bunny" and paper_object("Pudding-soft") == "pudding"
     assert paper_object("bunnyhop") is None and paper_object("cat") is None

@@ -7,7 +7,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, INIT_FROM, NOT_EVALUATED, UNFINISHED, RunRecord, dig
@@ -80,15 +80,6 @@ class Group:
     def evaluated(self) -> list[RunRecord]:
         """The evaluated runs."""
         return [r for r in self.runs if r.summary is not None]
-
-    def singles(self) -> list[Group]:
-        """Each evaluated run as a separate group."""
-        return [
-            replace(self, about={names: (run,)})
-            for names, same in self.about.items()
-            for run in same
-            if run.summary is not None
-        ]
 
     def entries(self, name: str) -> list[tuple[RunRecord, dict[str, Any]]]:
         """Evaluated runs and their entries of an object."""
@@ -276,7 +267,7 @@ def says(group: Group) -> list[str]:
     return list(dict.fromkeys(note for entry in entries for note in footnotes(entry, group.method)))
 
 
-# Facts that the seeds of a row must have in common, by their place in a summary.
+# Facts that all runs on an object must have in common, by their place in a summary.
 _COMPARED = {
     "sequences": ("sequences",),
     "ranges of frames": ("splits",),
@@ -286,13 +277,15 @@ _COMPARED = {
 
 def _notes(groups: Sequence[Group]) -> list[str]:
     notes = []
+    for name in dict.fromkeys(name for group in groups for name in group.objects):
+        told = [(run.name, entry) for group in groups for run, entry in group.entries(name)]
+        for what, keys in _COMPARED.items():
+            kinds = {json.dumps(found): run for run, e in told if (found := dig(e, *keys))}
+            if len(kinds) > 1:
+                runs = ", ".join(kinds.values())
+                notes.append(f"{name}: runs were evaluated on different {what} and cannot be compared, as {runs}.")
     for group in groups:
         notes += [f"{group.label}: {note}" for note in says(group)]
-        for name in group.objects:
-            entries = [entry for _, entry in group.entries(name)]
-            for what, keys in _COMPARED.items():
-                if len({json.dumps(found) for e in entries if (found := dig(e, *keys))}) > 1:
-                    notes.append(f"{group.label}, {name}: the seeds were evaluated on different {what}.")
         for same in group.about.values():
             seeds = Counter(str(r.seed) for r in same if r.summary is not None)
             twice = [seed for seed, count in seeds.items() if count > 1]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -193,37 +192,26 @@ def _references(
         for row in e["rows"] if row not in e["methods"]
     )  # fmt: skip
 
+    # References depend neither on the method nor on the seed: the first run that has one shows it.
+    alone = {
+        name: [replace(g, about={(name,): (run,)}) for g in study.groups for run, _ in g.entries(name)]
+        for name, _ in columns
+    }
+
     def find(group: Group, name: str, split: str, row: str) -> Cell:
         if row != FLOOR:
             return cell(group, name, split, views, metric, row=row)
         return pooled(group, name, lambda e: dig(e, "floor", metric), metric) if split == "seen" else Cell(None)
 
+    def first(name: str, split: str, row: str) -> Cell:
+        return next((c for one in alone[name] if (c := find(one, name, split, row)).value), Cell(None))
+
     lines = []
     for row in [*rows, *([FLOOR] if views == "train" else [])]:
-        versions = [_versions(study, [partial(find, name=name, split=s, row=row) for s in splits])
-                    for name, splits in columns]  # fmt: skip
-        for place in range(max(map(len, versions), default=0)):
-            entries: list[Entry] = []
-            for (_, splits), version in zip(columns, versions, strict=True):
-                cells = version[place] if place < len(version) else [Cell(None)] * len(splits)
-                entries += [entry(c if c.value else Cell(None), info) for c in cells]
-            lines.append(Line(row if place == 0 else f"{row} [{place + 1}]", REFERENCE, tuple(entries)))
-    return lines
-
-
-def _versions(study: Study, finds: Sequence[Callable[[Group], Cell]]) -> list[list[Cell]]:
-    """The cells of a reference on one object: several if runs were evaluated on different sequences or scenes.
-
-    References do not depend on seeds, so runs are not averaged; runs with equal figures have one cell.
-    """
-    found: dict[tuple[Any, ...], list[Cell]] = {}
-    for single in (one for group in study.groups for one in group.singles()):
-        cells = [find(single) for find in finds]
+        cells = [first(name, split, row) for name, splits in columns for split in splits]
         if any(c.value for c in cells):
-            key = tuple(None if c.value is None else float(f"{c.value.mean:.6g}") for c in cells)
-            same = found.get(key, [replace(c, runs=()) for c in cells])
-            found[key] = [replace(k, runs=k.runs + c.runs) for k, c in zip(same, cells, strict=True)]
-    return list(found.values())
+            lines.append(Line(row, REFERENCE, tuple(entry(c, info) for c in cells)))
+    return lines
 
 
 def _paper_lines(columns: Sequence[tuple[str, list[str]]], metric: str, views: str) -> list[Line]:
