@@ -23,9 +23,9 @@ def test_the_whole_report(tmp_path, capsys):
         and "pictures of toy_bunny" in shown.err
     )
     page = (sweep / "report" / "report.html").read_text()
-    # Four pictures, three videos of runs with a poster each, and one of both rows side by side.
+    # Three pictures, three videos of runs with a poster each, and one of both rows side by side.
     kinds = [page.count(f"data:{kind};base64,") for kind in ("image/webp", "image/jpeg", "video/mp4")]
-    assert kinds == [4, 3, 4]
+    assert kinds == [3, 3, 4]
     # The report does not take itself for a run.
     folders = [str(sweep / "full"), str(sweep / "no_mass")]
     out = tmp_path / "elsewhere"

@@ -1,4 +1,4 @@
-"""Pictures of a report, as data URIs: error curves, space-time slices, image grids, cameras side by side, videos."""
+"""Pictures of a report, as data URIs: error curves, space-time slices, frames of several cameras, videos."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gausim.core import GausSimError
 from gausim.io.video import SMALL, write_video
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.gather.study import Group, Study
-from gausim.report.pictures.figures import contact_frames, error_plot, literal, panels_plot, slices_plot
+from gausim.report.pictures.figures import error_plot, literal, panels_plot, slices_plot
 from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
 from gausim.report.pictures.motion import diagnosis_plot
 from gausim.results.curves import ObjectCurves, load_curves
@@ -58,7 +58,7 @@ def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
         figures.append(_error_curves(name, curves))
     figures += _motions(study, name)
     for shown in _shown(study, name, problems):
-        figures += [_slices(shown), _grid(shown), _cameras(shown)]
+        figures += [_slices(shown), _frames(shown)]
         # The first screens have a video of each method; this one compares them.
         figures += [_video(shown)] if len(shown.columns) > 2 else []
     return figures, problems
@@ -149,28 +149,16 @@ def _slices(shown: Shown) -> Exhibit:
     return Exhibit(f"Space-time slices: {pictures.object}", shown.note, "image", _drawn(figure))
 
 
-def _grid(shown: Shown) -> Exhibit:
-    """Chosen frames in the first camera, one row per method."""
-    pictures, view = shown.pictures, _some_views(shown.pictures)[0]
-    places = [(f, view, str(f)) for f in contact_frames(len(pictures.truth), pictures.first_unseen)]
-    title = f"Frames: {pictures.object}, {_view_name(pictures, view)}"
-    return Exhibit(title, f"Orange numbers: foreseen frames. {shown.note}", "image", _panels(shown, places))
-
-
-def _cameras(shown: Shown) -> Exhibit:
-    """The last seen, an unseen and the last frame in several cameras."""
+def _frames(shown: Shown) -> Exhibit:
+    """The last seen, an unseen and the last frame in several cameras, one row per method."""
     pictures = shown.pictures
     last, border = len(pictures.truth) - 1, pictures.first_unseen
     chosen = sorted({min(border - 1, last), min((border + last) // 2, last), last})
-    places = [(f, v, f"{_view_name(pictures, v)}, {f}") for f in chosen for v in _some_views(pictures)]
-    title = f"Several cameras: {pictures.object}"
-    return Exhibit(title, f"Camera and frame; orange: foreseen. {shown.note}", "image", _panels(shown, places))
-
-
-def _panels(shown: Shown, places: Sequence[tuple[int, int, str]]) -> str:
-    """One row per method; ``places`` are frame, view and heading of the columns."""
-    rows = [(_short(label), [images[f, v] for f, v, _ in places]) for label, images in shown.columns]
-    return _drawn(panels_plot(rows, [(head, f >= shown.pictures.first_unseen) for f, _, head in places]))
+    places = [(f, v) for f in chosen for v in _some_views(pictures)]
+    rows = [(_short(label), [images[place] for place in places]) for label, images in shown.columns]
+    heads = [(f"{_view_name(pictures, v)}, {f}", f >= border) for f, v in places]
+    caption = f"Camera and frame; orange: foreseen. {shown.note}"
+    return Exhibit(f"Frames: {pictures.object}", caption, "image", _drawn(panels_plot(rows, heads)))
 
 
 def _video(shown: Shown) -> Exhibit:
