@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from helpers import colmap_files, public_sets, toy_corpus, toy_object
 
+from data_prep.blender.meshes import read_mesh
 from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
 from data_prep.capture.films.film import pictures, probe, upright
 from data_prep.capture.films.takes import find_takes
@@ -95,6 +96,13 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     text.write_bytes(head + b"end_header\n" + rows.encode() + b"\n")
     yield Reader("scene, text", text, "text", load_scene)
     yield Reader("points", text, "text", load_points)
+    mesh = folder / "mesh.ply"
+    mesh.write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        b"element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        b"0 0 0\n1 0 0\n1 1 0\n0 1 1\n4 0 1 2 3\n3 0 2 3\n"
+    )
+    yield Reader("mesh", mesh, "text", lambda p: vars(read_mesh(p)))
     yield Reader("masks", path.with_name("scene.masks.npz"), "npz", lambda p: load_masks(SCENE, p))
     save_trajectory(folder / "scene" / "t.safetensors", toy.truth("seq_000", 3), facts={"object": "toy"})
     yield Reader("trajectory", folder / "scene" / "t.safetensors", "binary", load_trajectory, 8)

@@ -7,48 +7,28 @@ needs, are in ``<stem>.masks.npz`` next to it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
-from gausim.core.errors import SceneError
+from gausim.core.errors import DataError, SceneError
 from gausim.core.scene import GaussianScene
 from gausim.io.files import replacing
 from gausim.io.npz import read_npz
+from gausim.io.ply_elements import read_elements
 
 MASK_SUFFIX = ".masks.npz"
 MASK_NAMES = ("simulated", "pinned", "foreground")
 
-# Type names of the PLY specification, and synonyms of later writers.
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 # f_rest has (d + 1)^2 - 1 coefficients for each of three channels.
 _REST_COUNTS = (0, 9, 24, 45)
 _POSITION, _COLOR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-# Far above any header of a Gaussian scene; a binary file without end_header must not be read whole as text.
-_HEADER_LIMIT = 1 << 16
-
-
-@dataclass(frozen=True)
-class _Header:
-    """Vertex declaration of a PLY header."""
-
-    encoding: str
-    count: int
-    dtype: np.dtype
-    offset: int  # start of the vertex data [bytes]
-    only_element: bool
 
 
 def masks_path(path: Path | str) -> Path:
@@ -69,10 +49,10 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     """
     path = Path(path)
     table = _read_vertices(path)
-    rest = _rest_names(path, table.dtype.names or ())
+    rest = _rest_names(path, tuple(table))
     values = torch.from_numpy(_columns(path, table, [*_POSITION, *_SHAPE, *_COLOR, *rest]))
     means, opacity, log_scales, quats, color, high = values.split((3, 1, 3, 4, 3, len(rest)), dim=1)
-    sh = torch.cat([color[:, None], high.reshape(len(table), 3, -1).transpose(1, 2)], dim=1)
+    sh = torch.cat([color[:, None], high.reshape(len(values), 3, -1).transpose(1, 2)], dim=1)
     try:
         scene = GaussianScene.create(
             means=means.contiguous(),
@@ -96,7 +76,7 @@ def load_points(path: Path | str) -> np.ndarray:
     """
     path = Path(path)
     table = _read_vertices(path)
-    if not set(_POSITION) <= set(table.dtype.names or ()):
+    if not set(_POSITION) <= set(table):
         raise SceneError(f"{path}: a property x, y or z is missing. Expected points.")
     return _columns(path, table, list(_POSITION))
 
@@ -181,11 +161,11 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     return rest
 
 
-def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
+def _columns(path: Path, table: Mapping[str, np.ndarray], names: list[str]) -> np.ndarray:
     """These properties of all vertices, (K, n) float32, all finite."""
     # Doubles beyond float32 overflow to infinity, which the check below reports instead of a warning.
     with np.errstate(over="ignore"):
-        values = structured_to_unstructured(table[names], np.float32)
+        values = np.stack([table[name] for name in names], 1, dtype=np.float32, casting="same_kind")
     bad = ~np.isfinite(values)
     if bad.any():
         column = int(bad.any(0).argmax())
@@ -197,82 +177,16 @@ def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
     return values
 
 
-def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex table, after checking the number of bytes (or lines) against the header."""
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file. Expected a 3DGS scene or points in PLY format.")
-    header = _read_header(path)
-    if header.count == 0:
-        raise SceneError(f"{path}: element 'vertex' is empty; expected at least one Gaussian.")
-    if header.encoding == "ascii":
-        return _read_text(path, header)
-    expected = header.count * header.dtype.itemsize
-    actual = path.stat().st_size - header.offset
-    # Some writers end the file with a line break; a whole extra vertex means that the count is wrong.
-    too_long = header.only_element and actual >= expected + header.dtype.itemsize
-    if actual < expected or too_long:
-        raise SceneError(
-            f"{path}: element 'vertex' declares {header.count} vertices of {header.dtype.itemsize} bytes = {expected} "
-            f"bytes, but the file holds {actual} bytes of data. It is "
-            f"{'not what its header says' if too_long else 'truncated'}; copy or export it again."
-        )
-    return np.fromfile(path, dtype=header.dtype, count=header.count, offset=header.offset)
-
-
-def _read_text(path: Path, header: _Header) -> np.ndarray:
-    names = header.dtype.names or ()
-    wanted = f"{path}: element 'vertex' declares {header.count} vertices of {len(names)} numbers"
-    lines = [line for line in path.read_bytes()[header.offset :].split(b"\n") if line.strip()][: header.count]
-    if len(lines) < header.count:
-        raise SceneError(f"{wanted}, but the file holds {len(lines)} lines. It is truncated; copy or export it again.")
+def _read_vertices(path: Path) -> dict[str, np.ndarray]:
+    """The properties of the vertices, which have to be the first element."""
     try:
-        values = np.array([line.split() for line in lines], np.float64)
-    except ValueError as error:
-        raise SceneError(f"{wanted}, but not every line holds so many ({error!s:.80}). Export it again.") from error
-    if values.shape[1] != len(names):
-        raise SceneError(f"{wanted}, but the lines hold {values.shape[1]}. Export it again.")
-    return values.view([(name, np.float64) for name in names])[:, 0]
-
-
-def _read_header(path: Path) -> _Header:
-    with path.open("rb") as file:
-        start = file.read(_HEADER_LIMIT)
-    if not start.startswith((b"ply\n", b"ply\r\n")):
-        raise SceneError(f"{path}: expected a PLY file (first line 'ply'), got {start[:8]!r}. Check the file format.")
-    end = start.find(b"end_header")
-    stop = start.find(b"\n", end)
-    if end < 0 or stop < 0:
-        raise SceneError(f"{path}: line 'end_header' is missing. The file is truncated or not a PLY; export it again.")
-    lines = [line.split() for line in start[:end].decode("ascii", errors="replace").splitlines()[1:] if line.strip()]
-    return _parse_header(path, lines, stop + 1)
-
-
-def _parse_header(path: Path, lines: list[list[str]], offset: int) -> _Header:
-    encoding = ""
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for words in lines:
-        if words[0] == "format" and len(words) == 3 and words[1] in _BYTE_ORDER:
-            encoding = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
-            elements.append((words[1], int(words[2]), []))
-        elif words[0] == "property" and elements and len(words) >= 3:
-            elements[-1][2].append(words[1:])
-        elif words[0] not in ("comment", "obj_info"):
-            raise SceneError(f"{path}: header line '{' '.join(words)}' is not understood. Export the file again.")
-    if not encoding:
-        raise SceneError(f"{path}: header line 'format' is missing; expected binary_little_endian 1.0.")
-    if not elements or elements[0][0] != "vertex":
-        found = ", ".join(e[0] for e in elements) or "none"
+        element, table = next(read_elements(path), (None, {}))
+    except DataError as error:
+        raise SceneError(str(error)) from error
+    if element is None or element.name != "vertex":
+        found = "none" if element is None else f"'{element.name}'"
         raise SceneError(f"{path}: first element must be 'vertex', got {found}. Expected a 3DGS scene.")
-    _, count, properties = elements[0]
-    fields: dict[str, str] = {}
-    for *kind, name in properties:
-        if len(kind) != 1 or kind[0] not in _TYPES:
-            raise SceneError(
-                f"{path}: property '{name}' of element 'vertex' has type '{' '.join(kind)}'; expected one of "
-                f"{', '.join(_TYPES)}. Export the file as a 3DGS scene."
-            )
-        if name in fields:
-            raise SceneError(f"{path}: property '{name}' of element 'vertex' is declared twice. Export it again.")
-        fields[name] = _BYTE_ORDER[encoding] + _TYPES[kind[0]]
-    return _Header(encoding, count, np.dtype(list(fields.items())), offset, len(elements) == 1)
+    if element.count == 0 or element.lists:
+        what = f"property '{element.lists[0]}' is a list" if element.lists else "is empty"
+        raise SceneError(f"{path}: element 'vertex': {what}. Export the file as a 3DGS scene.")
+    return table

@@ -1,0 +1,163 @@
+"""Elements of PLY files, in text or binary of either byte order, read without trusting what a header declares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gausim.core.errors import DataError
+
+# Type names of the PLY specification, and synonyms of later writers.
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+# Far above any header of a scene or a mesh; a binary file without end_header must not be read whole as text.
+_HEADER_LIMIT = 1 << 16
+
+
+@dataclass
+class Element:
+    """One kind of thing in a PLY file."""
+
+    name: str  # e.g. ``vertex``
+    count: int  # how many there are
+    fields: dict[str, tuple[str, str]]  # numpy's types as stored: of a property, and of a list's length, else empty
+
+    @property
+    def lists(self) -> list[str]:
+        """The fields that are lists."""
+        return [name for name, (_, counter) in self.fields.items() if counter]
+
+    def layout(self, lengths: Mapping[str, int]) -> np.dtype:
+        """Memory layout of one whose lists have these lengths, up to the first list without."""
+        parts: list[Any] = []
+        for name, (kind, counter) in self.fields.items():
+            parts += [(f"number of {name}", counter)] if counter else []
+            if counter and name not in lengths:
+                break
+            parts.append((name, kind, (lengths[name],) if counter else ()))
+        return np.dtype(parts)
+
+
+def read_elements(path: Path) -> Iterator[tuple[Element, dict[str, Any]]]:
+    """The elements of a file in their order, each with its columns by name; numbers of a text are float64.
+
+    A column is an array with one row per thing, or a list of arrays where lists differ in length.
+
+    Raises:
+        DataError: the file is missing, no PLY file, cut off, or longer than its header says.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file. Expected a scene, points or a mesh in PLY format.")
+    data = path.read_bytes()
+    text, elements, start = _header(path, data)
+    body, at = memoryview(_numbers(path, data[start:]) if text else data[start:]), 0
+    for element in elements:
+        columns, at = _take(path, element, body, at)
+        # Some writers end with a line break; room for one thing more means that the number of things is wrong.
+        least = 1 if text else element.layout({}).itemsize
+        if element is elements[-1] and not element.lists and len(body) - at >= least:
+            raise DataError(
+                f"{path}: has {len(body) - at} bytes after {element.count} of '{element.name}'. It is not what its "
+                "header says; export it again."
+            )
+        yield element, columns
+
+
+def _header(path: Path, data: bytes) -> tuple[bool, list[Element], int]:
+    """Whether it is a text, elements, and where their data start [bytes]."""
+    if not data.startswith((b"ply\n", b"ply\r\n")):
+        raise DataError(f"{path}: expected a PLY file (first line 'ply'), got {data[:8]!r}. Check the file format.")
+    end = data.find(b"end_header", 0, _HEADER_LIMIT)
+    stop = data.find(b"\n", end, _HEADER_LIMIT)
+    if end < 0 or stop < 0:
+        raise DataError(f"{path}: line 'end_header' is missing. The file is truncated or not a PLY; export it again.")
+    encoding, elements = "", list[Element]()
+    for line in data[:end].decode("latin-1").splitlines()[1:]:
+        try:
+            match line.split():
+                case ["format", encoding, _] if encoding in _BYTE_ORDER:
+                    pass
+                case ["element", name, count] if count.isascii() and count.isdigit():
+                    elements.append(Element(name, int(count), {}))
+                case ["property", *kinds, name] if elements and name not in elements[-1].fields:
+                    elements[-1].fields[name] = _field(kinds, encoding)
+                case [first, *_] if first not in ("comment", "obj_info"):
+                    raise ValueError("an unknown or repeated line")
+        except (IndexError, KeyError, ValueError) as error:
+            raise DataError(f"{path}: header line '{line[:60]}' is not understood ({error}). Export again.") from None
+    if not encoding:
+        raise DataError(f"{path}: header line 'format' is missing; expected one of {', '.join(_BYTE_ORDER)} 1.0.")
+    for element in elements:
+        # Every thing takes at least a byte, so that a file's size bounds what it may declare.
+        if element.count > len(data) or (element.count and not element.fields):
+            raise _truncated(path, element, len(data))
+    return encoding == "ascii", elements, stop + 1
+
+
+def _field(kinds: list[str], encoding: str) -> tuple[str, str]:
+    """Types of a property as stored; all numbers of a text are read as float64, whatever the header calls them."""
+    counter = _TYPES[kinds[1]] if kinds[0] == "list" else ""
+    if len(kinds) != (3 if counter else 1) or counter.startswith("f"):
+        raise ValueError("expected a type, or 'list' with the types of length and values")
+    order = _BYTE_ORDER.get(encoding, "")
+    stored = [order + (code if encoding != "ascii" else "f8") for code in (_TYPES[kinds[-1]], counter)]
+    return stored[0], stored[1] if counter else ""
+
+
+def _numbers(path: Path, text: bytes) -> bytes:
+    """The words of a text as float64."""
+    try:
+        return np.array(text.split(), np.float64).tobytes()
+    except ValueError as error:
+        raise DataError(f"{path}: expected numbers after the header ({error!s:.80}). Export it again.") from None
+
+
+def _take(path: Path, element: Element, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
+    """The columns of an element whose data begin at a byte, and where they end."""
+    if not element.count:
+        return {name: np.zeros(0) for name in element.fields}, at
+    layout = _layout(path, element, body, at)
+    end = at + layout.itemsize * element.count
+    if end <= len(body):
+        rows = np.frombuffer(body, layout, element.count, at)
+        if all((rows[f"number of {name}"] == rows[name].shape[1]).all() for name in element.lists):
+            return {name: rows[name] for name in element.fields}, end
+    if not element.lists:
+        raise _truncated(path, element, len(body) - at)
+    found: dict[str, list[Any]] = {name: [] for name in element.fields}
+    for _ in range(element.count):
+        row = np.frombuffer(body, layout := _layout(path, element, body, at), 1, at)[0]
+        at += layout.itemsize
+        for name, values in found.items():
+            values.append(row[name])
+    return found, at
+
+
+def _layout(path: Path, element: Element, body: memoryview, at: int) -> np.dtype:
+    """Memory layout of the thing at a byte, all of which is there."""
+    lengths = dict[str, int]()
+    for name in (*element.lists, None):
+        layout = element.layout(lengths)
+        if at + layout.itemsize > len(body):
+            raise _truncated(path, element, len(body) - at)
+        if name is not None:
+            length = float(np.frombuffer(body, layout, 1, at)[0][f"number of {name}"])
+            if not (length.is_integer() and 0 <= length <= len(body)):
+                raise DataError(f"{path}: list '{name}' of '{element.name}' has length {length:g}. Export it again.")
+            lengths[name] = int(length)
+    return layout
+
+
+def _truncated(path: Path, element: Element, left: int) -> DataError:
+    return DataError(
+        f"{path}: declares {element.count} of '{element.name}', for which {left} bytes are too few. It is truncated; "
+        "copy or export it again."
+    )
