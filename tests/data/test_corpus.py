@@ -7,20 +7,20 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.toy_corpus import write_toy_corpus
+from helpers.corpus import write_corpus
 from safetensors.torch import load_file, save_file
 
 from gausim.core import DataError
 from gausim.data.corpus import MANIFEST, Corpus
 
-SHARD, NAME = "shard_00001.safetensors", "toy_000002"
+SHARD, NAME = "shard_00001.safetensors", "beam2"
 
 
 def test_a_body_is_read_as_it_was_written(tmp_path: Path) -> None:
-    corpus = Corpus(write_toy_corpus(tmp_path / "corpus"))
+    corpus = Corpus(write_corpus(tmp_path / "corpus"))
     body, written = corpus.body(2), load_file(corpus.path / SHARD)
     assert len(corpus) == 3 and body.name == NAME and body.fps == 24 and body.record.shard == SHARD
-    assert body.positions.shape == (2, 6, 40, 3) and body.pinned.dtype == torch.bool
+    assert body.positions.shape == (2, 24, 81, 3) and body.pinned.dtype == torch.bool
     moved = (body.positions - body.rest) / body.record.diagonal
     torch.testing.assert_close(moved, written[f"{NAME}.displacement"].float(), rtol=0, atol=1e-6)
     assert moved.abs().max() > 0.01 and not moved[:, :, body.pinned].any()
@@ -47,7 +47,7 @@ def truncated(root: Path) -> None:
     ("damage", "message"),
     [
         (changed("rest", lambda x: None), rf"{SHARD}: tensor '{NAME}.rest' is missing"),
-        (changed("rest", lambda x: x[:-1]), rf"{NAME}.rest' is torch.float32 \(39, 3\), expected .* \(40, 3\)"),
+        (changed("rest", lambda x: x[:-1]), rf"{NAME}.rest' is torch.float32 \(80, 3\), expected .* \(81, 3\)"),
         (changed("displacement", lambda x: x.float()), r"displacement' is torch.float32 .*expected torch.float16"),
         (changed("displacement", lambda x: x * torch.inf), "displacement' has values that are no finite"),
         (changed("stiffness", lambda x: -x), "stiffness' has values that are not positive"),
@@ -55,11 +55,11 @@ def truncated(root: Path) -> None:
     ],
 )
 def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
-    corpus = Corpus(write_toy_corpus(tmp_path / "corpus"))
+    corpus = Corpus(write_corpus(tmp_path / "corpus"))
     damage(corpus.path)
     with pytest.raises(DataError, match=message):
         corpus.body(2)
-    assert corpus.body(0).name == "toy_000000"  # in another shard
+    assert corpus.body(0).name == "beam0"  # in another shard
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None]
     ],
 )
 def test_a_damaged_manifest_is_named(tmp_path: Path, key: str, value: object, message: str) -> None:
-    path = write_toy_corpus(tmp_path / "corpus") / MANIFEST
+    path = write_corpus(tmp_path / "corpus") / MANIFEST
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
     with pytest.raises(DataError, match=re.escape(str(path)) + ".*" + message):
         Corpus(path.parent)
@@ -80,7 +80,7 @@ def test_a_damaged_manifest_is_named(tmp_path: Path, key: str, value: object, me
 def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="manifest.json: not found. Make a corpus"):
         Corpus(tmp_path)
-    root = write_toy_corpus(tmp_path / "corpus")
+    root = write_corpus(tmp_path / "corpus")
     (root / SHARD).unlink()
     with pytest.raises(DataError, match=f"{SHARD}: not found, though"):
         Corpus(root)

@@ -16,7 +16,8 @@ import av
 import cv2
 import numpy as np
 import torch
-from helpers import colmap_files, public_sets, toy_corpus, toy_object
+from helpers import colmap_files, public_sets, toy_object
+from helpers.corpus import write_corpus
 
 from data_prep.blender.meshes import read_mesh
 from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
@@ -151,7 +152,7 @@ def _object(folder: Path) -> Iterator[Reader]:
     yield Reader("frame", sequence / "cam_0" / "0000.png", "png", whole)
     yield Reader("any json", root / "dataset.json", "json", read_json, 2)
     yield from _surroundings(folder)
-    bodies = toy_corpus.write_toy_corpus(folder / "bodies", bodies=1)
+    bodies = write_corpus(folder / "bodies", bodies=1)
 
     def body(_: Path) -> Any:
         found = Corpus(bodies).body(0)
