@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
-from data_prep.common.faults import refuse_faults
+from data_prep.common.objects import described, object_facts, refuse_faults, train_command
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, copy_missing, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
@@ -107,15 +107,7 @@ def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[
             f"--train-frames {wanted}: {shortest} has {lengths[shortest]} frames; expected 2 to {lengths[shortest]}, "
             "or leave that sequence out."
         )
-    return {
-        **given,
-        "name": options.name or given.get("name") or name,
-        "fps": fps,
-        "views": list(views),
-        "train_views": [view for view in views if view not in heldout],
-        "heldout_views": [view for view in views if view in heldout],
-        "train_frames": [0, wanted],
-    }
+    return given | object_facts(options.name or given.get("name") or name, fps, views, heldout, wanted)
 
 
 def _checked(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,16 +176,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about the object, for people."""
-    facts = results["facts"]
-    frames = sorted(results["sequences"].values())
-    length = str(frames[0]) if frames[0] == frames[-1] else f"{frames[0]} to {frames[-1]}"
-    trained, left = facts["train_views"], facts["heldout_views"]
-    lines = [
-        f"stills      {results['stills']}",
-        f"sequences   {len(frames)}, {length} frames at {facts['fps']:g} per second",
-        f"cameras     train {', '.join(trained)}; never trained on: {', '.join(left) or 'none'}",
-        f"frames      0 to {facts['train_frames'][1] - 1} are trained on",
-    ]
+    lines = described(results["facts"], results["stills"], results["sequences"])
     if results["scene"]:
-        return "\n".join([*lines, f"train       gausim train data=object data.root={out} name={facts['name']}"])
+        return "\n".join([*lines, f"train       {train_command(results['facts'], out)}"])
     return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])

@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
-from data_prep.common.faults import refuse_faults
+from data_prep.common.objects import described, object_facts, refuse_faults, train_command
 from data_prep.common.photos import list_images, natural
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.fields import check_name
-from data_prep.public.importing import train_command
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
 
@@ -236,8 +235,7 @@ def _facts(found: _Capture, options: PhysDreamerOptions, fps: float, shortest: i
         raise DataError(
             f"{found.root / VIDEOS}: a film has {shortest} frames, fewer than the {max(2, trained)} to train on."
         )
-    views = {"views": [found.view], "train_views": [found.view], "heldout_views": []}
-    return {"name": options.name or found.root.absolute().name, "fps": fps, **views, "train_frames": [0, trained]}
+    return object_facts(options.name or found.root.absolute().name, fps, [found.view], (), trained)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -261,13 +259,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about what was imported, for people."""
-    facts, frames = results["facts"], min(results["sequences"].values())
-    lines = [
-        f"stills      {results['stills']}",
-        f"sequences   {len(results['sequences'])}, {frames} frames at {facts['fps']:g} per second",
-        f"camera      {facts['views'][0]}",
-        f"scene       {results['scene']}",
-    ]
+    facts = results["facts"]
+    lines = [*described(facts, results["stills"], results["sequences"]), f"scene       {results['scene']}"]
     if results["without_alpha"]:
         lines.append(f"no alpha    in {', '.join(results['without_alpha'])}: segment {out} next")
     else:

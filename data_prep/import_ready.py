@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
+from data_prep.common.objects import object_facts
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
@@ -89,22 +90,12 @@ def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> d
         write_points(work / "points.npz", points, points.xyz, points.rgb)
     results["scene"] = write_scene(work, files.root, options.near)
     results["without_alpha"] = sorted(writer.bare)
-    _facts(work / "dataset.json", files, options)
+    facts = object_facts(
+        options.name or files.root.name, options.fps, files.views, options.heldout, options.train_frames
+    )
+    used = {f"{part}_sequences": [n for n in files.frames if n in files.meta.lists[part]] for part in ("train", "test")}
+    write_json(work / "dataset.json", facts | used)
     return {**results, "files": files_in(work)}
-
-
-def _facts(path: Path, files: ReadyFiles, options: ReadyOptions) -> None:
-    facts = {
-        "name": options.name or files.root.name,
-        "fps": options.fps,
-        "views": list(files.views),
-        "train_views": [view for view in files.views if view not in options.heldout],
-        "heldout_views": list(options.heldout),
-        "train_frames": [0, options.train_frames],
-        "train_sequences": [name for name in files.frames if name in files.meta.lists["train"]],
-        "test_sequences": [name for name in files.frames if name in files.meta.lists["test"]],
-    }
-    write_json(path, facts)
 
 
 def main(argv: list[str] | None = None) -> int:

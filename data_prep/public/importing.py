@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
+from data_prep.common.objects import described, train_command
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.scene import PublicObject
 from data_prep.public.writer import POINTS, ObjectWriter
 
 PACKAGES = ("numpy", "opencv-python-headless", "scipy")
-# Predicted steps that training ends with unless it is told otherwise (conf/data/object.yaml).
-CURRICULUM = 15
 
 
 @dataclass(frozen=True)
@@ -98,25 +97,10 @@ def summaries(results: Mapping[str, Any], out: Path) -> list[str]:
 
 def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about an object that was imported, for people."""
-    facts, frames = results["facts"], sorted(results["sequences"].values())
-    length = str(frames[0]) if frames[0] == frames[-1] else f"{frames[0]} to {frames[-1]}"
-    heldout = ", ".join(facts["heldout_views"]) or "none"
-    lines = [
-        f"object      {facts['name']}",
-        f"stills      {results['stills']}",
-        f"sequences   {len(frames)}, {length} frames at {facts['fps']:g} per second",
-        f"cameras     {', '.join(facts['train_views'])}; never trained on: {heldout}",
-        f"frames      0 to {facts['train_frames'][1] - 1} are trained on",
-    ]
+    facts = results["facts"]
+    lines = [f"object      {facts['name']}", *described(facts, results["stills"], results["sequences"])]
     lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free", "grip") if key in facts]
     lines += [f"{key:<11} {value}" for key, value in results.get("notes", {}).items()]
     start = f" --points {out / POINTS}" if results["points"] else ""
     lines.append(f"next        gausim reconstruct {out}{start}")
     return "\n".join([*lines, f"then        {train_command(facts, out)}"])
-
-
-def train_command(facts: Mapping[str, Any], out: Path) -> str:
-    """The command that trains on an object; a curriculum longer than its frames would be refused."""
-    steps = facts["train_frames"][1] - 1
-    shorter = f" data.curriculum.t_max={steps}" if steps < CURRICULUM else ""
-    return f"gausim train data=object data.root={out}{shorter} name={facts['name']}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from data_prep.capture.cameras.output import write_cameras
 from data_prep.capture.masks.clips import write_picture
-from data_prep.common.faults import refuse_faults
+from data_prep.common.objects import object_facts, refuse_faults
 from data_prep.common.progress import Tick
 from data_prep.common.stage import copy_missing, write_npz
 from data_prep.public.pictures import resized
@@ -28,13 +28,13 @@ class ObjectWriter:
         """Takes the folder to write to, what was read, the longest side of pictures [pixels], and who is told."""
         self._work, self._found, self._longest, self._tick = work, found, longest, tick
 
-    def write(self, out: Path, *, check: bool = True) -> dict[str, Any]:
+    def write(self, out: Path) -> dict[str, Any]:
         """Writes everything that is missing and returns what is worth telling; ``out`` is the result's later name.
 
         Raises:
             DataError: a picture is unusable, or the object would have faults.
         """
-        found = self._found.checked()
+        found = self._found
         for motion in found.motions:
             self._motion(motion)
         stills = self._stills()
@@ -42,10 +42,9 @@ class ObjectWriter:
         if found.cloud is not None:
             points, colors = found.cloud
             write_npz(self._work / POINTS, points=points.astype(np.float32), colors=colors)
-        facts = dataset_facts(found)
+        facts = object_facts(found.name, found.fps, found.views, found.heldout, found.train_frames) | dict(found.world)
         write_json(self._work / "dataset.json", facts)
-        if check:
-            refuse_faults(self._work, out)
+        refuse_faults(self._work, out)
         frames = {motion.name: motion.count for motion in found.motions}
         told = {"points": found.cloud is not None, **found.told}
         return {"facts": facts, "stills": stills, "sequences": frames, **told}
@@ -105,19 +104,6 @@ class ObjectWriter:
         for motion, positions in zip(self._found.motions, tracks, strict=True):
             path = self._work / "sequences" / motion.name / "ground_truth.npz"
             write_npz(path, displacement=(positions - rest).astype(np.float32))
-
-
-def dataset_facts(found: PublicObject) -> dict[str, Any]:
-    """The content of ``dataset.json``."""
-    return {
-        "name": found.name,
-        "fps": found.fps,
-        "views": list(found.views),
-        "train_views": [view for view in found.views if view not in found.heldout],
-        "heldout_views": [view for view in found.views if view in found.heldout],
-        "train_frames": [0, found.train_frames],
-        **found.world,
-    }
 
 
 def smaller(view: View, longest: int | None) -> View:

@@ -15,13 +15,13 @@ from helpers import public_sets
 from helpers.public_sets import FRAMES, SEEN, Sample
 
 from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
+from data_prep.common.objects import CURRICULUM, train_command
 from data_prep.import_3dgsim import GenesisOptions
 from data_prep.import_pacnerf import PacNerfOptions
 from data_prep.import_physdreamer import PhysDreamerOptions
 from data_prep.import_phystwin import PhysTwinOptions, together
 from data_prep.import_springgaus import SpringGausOptions
 from data_prep.public import registration
-from data_prep.public.importing import CURRICULUM, train_command
 from data_prep.public.pictures import before_white
 from gausim.core import ConfigError, GausSimError
 from gausim.data.objects import ObjectData
