@@ -7,7 +7,6 @@ import os
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 from helpers.plain import Call
-from helpers.public_sets import Sample
 
 from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
 from data_prep.import_3dgsim import GenesisOptions
@@ -24,8 +22,6 @@ from data_prep.import_physdreamer import PhysDreamerOptions
 from data_prep.import_phystwin import PhysTwinOptions
 from data_prep.import_springgaus import SpringGausOptions
 from gausim.core import GausSimError
-
-REAL = SpringGausOptions(object="bun", no_stills=True)
 
 
 @dataclass(frozen=True)
@@ -170,24 +166,15 @@ GENESIS = (
     Damage("0001/metadata.json", put("n_steps", to="many"), "field 'n_steps'"),
     Damage("0001/metadata.json", put("n_steps", to=25), "rgb_0024.png", "0001"),
     Damage("0001/metadata.json", put("n_cams", to=4), "field 'cam_3'"),
-    Damage("0001/metadata.json", put("file_path_template", to="cam_{cam_ix}/{n_step}"), "field 'file_path_template'"),
-    Damage(
-        "0001/metadata.json",
-        put("file_path_template", to="{cam_ix.real}{n_step}{img_type}"),
-        "field 'file_path_template'",
-    ),
-    Damage(
-        "0001/metadata.json",
-        put("file_path_template", to="{cam_ix}{n_step:99999999d}{img_type}"),
-        "field 'file_path_template'",
-    ),
-    Damage(
-        "0001/metadata.json",
-        put("file_path_template", to="../{cam_ix}{n_step}{img_type}"),
-        "field 'file_path_template'",
-    ),
-    Damage(
-        "0001/metadata.json", put("file_path_template", to="{cam_ix}{n_step}{img_type"), "field 'file_path_template'"
+    *(
+        Damage("0001/metadata.json", put("file_path_template", to=text), f"field 'file_path_template'{said}")
+        for text, said in {
+            "cam_{cam_ix}/{n_step}": "",
+            "{cam_ix.real}{n_step}{img_type}": "",
+            "{cam_ix}{n_step:99999999d}{img_type}": "",
+            "../{cam_ix}{n_step}{img_type}": "",
+            "{cam_ix}{n_step}{img_type": ": expected '}'",
+        }.items()
     ),
     Damage("0001/metadata.json", put("cam_1", "extrinsics", to=times(-1)), "field 'cam_1.extrinsics'"),
     Damage("0001/metadata.json", put("cam_1", "intrinsics", 2, 2, to=2), "field 'cam_1.intrinsics'"),
@@ -232,58 +219,37 @@ def harm(path: Path, change: Callable[[Any], Any] | None) -> None:
         path.write_bytes(change(path.read_bytes()))
 
 
-def check_refused(root: Path, damage: Damage, run: Callable[[Path], object], folder: Path) -> None:
+SETS: dict[str, tuple[tuple[Damage, ...], Callable[..., object], Any, dict[str, str]]] = {
+    "springgaus": (SPRINGGAUS, import_springgaus.import_springgaus, SpringGausOptions(), {}),
+    "real": (REAL_FILES, import_springgaus.import_springgaus, SpringGausOptions(object="bun", no_stills=True), {}),
+    "real, stills": (STILLS, import_springgaus.import_springgaus, SpringGausOptions(object="bun", turns=1), {}),
+    "pacnerf": (PACNERF, import_pacnerf.import_pacnerf, PacNerfOptions(), {}),
+    "phystwin": (PHYSTWIN, import_phystwin.import_phystwin, PhysTwinOptions(), {}),
+    "genesis": (GENESIS, import_3dgsim.import_3dgsim, GenesisOptions(fps=25), {}),
+    "physdreamer": (PHYSDREAMER, import_physdreamer.import_physdreamer, PhysDreamerOptions(anchor=0.4),
+                    {"video_masks": "../video_masks"}),
+}  # fmt: skip
+CASES = [
+    pytest.param(name, damage, id=f"{name}: {Path(damage.file).name}: {damage.told}")
+    for name, (damages, *_) in SETS.items()
+    for damage in damages
+]
+
+
+@pytest.mark.parametrize(("name", "damage"), CASES)
+def test_damaged_files_are_refused(name: str, damage: Damage, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    _, run, options, places = SETS[name]
+    sample = request.getfixturevalue(name.partition(",")[0])
+    root = sample if isinstance(sample, Path) else sample.root
     path = (root / damage.file).resolve()
     good = path.read_bytes()
     try:
         harm(path, damage.change)
         assert not path.exists() or path.read_bytes() != good, "the damage changes nothing"
         with pytest.raises(GausSimError) as caught:
-            run(folder / "out")
+            run(root, tmp_path / "out", options, **{key: root / place for key, place in places.items()})
     finally:
         path.write_bytes(good)
     text = str(caught.value)
     assert damage.told in text and (damage.named or path.name) in text, text
-    assert not (folder / "out").exists() and not Path("canary").exists()
-
-
-def ids(damages: tuple[Damage, ...]) -> list[str]:
-    return [f"{Path(damage.file).name}: {damage.told}" for damage in damages]
-
-
-@pytest.mark.parametrize("damage", SPRINGGAUS, ids=ids(SPRINGGAUS))
-def test_damaged_synthetic_falls_are_refused(damage: Damage, springgaus: Sample, tmp_path: Path) -> None:
-    run = partial(import_springgaus.import_springgaus, springgaus.root, options=SpringGausOptions())
-    check_refused(springgaus.root, damage, run, tmp_path)
-
-
-@pytest.mark.parametrize("damage", (*REAL_FILES, *STILLS), ids=ids((*REAL_FILES, *STILLS)))
-def test_damaged_real_captures_are_refused(damage: Damage, real: Sample, tmp_path: Path) -> None:
-    options = REAL if damage in REAL_FILES else SpringGausOptions(object="bun", turns=1)
-    check_refused(real.root, damage, partial(import_springgaus.import_springgaus, real.root, options=options), tmp_path)
-
-
-@pytest.mark.parametrize("damage", PACNERF, ids=ids(PACNERF))
-def test_damaged_falls_of_pac_nerf_are_refused(damage: Damage, pacnerf: Sample, tmp_path: Path) -> None:
-    run = partial(import_pacnerf.import_pacnerf, pacnerf.root, options=PacNerfOptions())
-    check_refused(pacnerf.root, damage, run, tmp_path)
-
-
-@pytest.mark.parametrize("damage", PHYSTWIN, ids=ids(PHYSTWIN))
-def test_damaged_cases_of_phystwin_are_refused(damage: Damage, phystwin: Sample, tmp_path: Path) -> None:
-    run = partial(import_phystwin.import_phystwin, phystwin.root, options=PhysTwinOptions())
-    check_refused(phystwin.root, damage, run, tmp_path)
-
-
-@pytest.mark.parametrize("damage", GENESIS, ids=ids(GENESIS))
-def test_damaged_samples_of_3dgsim_are_refused(damage: Damage, genesis: Sample, tmp_path: Path) -> None:
-    run = partial(import_3dgsim.import_3dgsim, genesis.root, options=GenesisOptions(fps=25))
-    check_refused(genesis.root, damage, run, tmp_path)
-
-
-@pytest.mark.parametrize("damage", PHYSDREAMER, ids=ids(PHYSDREAMER))
-def test_damaged_captures_of_physdreamer_are_refused(damage: Damage, physdreamer: Path, tmp_path: Path) -> None:
-    masks = physdreamer.parent / "video_masks"
-    options = PhysDreamerOptions(anchor=0.4)
-    run = partial(import_physdreamer.import_physdreamer, physdreamer, options=options, video_masks=masks)
-    check_refused(physdreamer, damage, run, tmp_path)
+    assert not (tmp_path / "out").exists() and not Path("canary").exists()
