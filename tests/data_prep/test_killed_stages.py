@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
 import runpy
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers import public_sets
+from helpers.toy_runs import Server
 
 from gausim.data.verify import verify
 
@@ -31,19 +28,8 @@ SHARES = (0.0, 0.5, 1.0)
 @pytest.fixture(scope="module")
 def run() -> Iterator[Run]:
     """Runs a stage in a child of its own."""
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, str(Path(__file__).with_name("killed_stages.py"))]
-    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stdin=subprocess.PIPE,
-                          stdout=subprocess.PIPE, text=True) as server:  # fmt: skip
-        assert server.stdin and server.stdout
-
-        def ask(stage: str, argv: list[str], die: int | None = None) -> dict[str, Any]:
-            server.stdin.write(json.dumps({"stage": stage, "argv": argv, "die": die}) + "\n")
-            server.stdin.flush()
-            return dict(json.loads(server.stdout.readline()))
-
-        yield ask
-        server.stdin.close()
+    with Server(Path(__file__).with_name("killed_stages.py")) as server:
+        yield server.ask
 
 
 @pytest.fixture(scope="module")
@@ -82,19 +68,12 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         "import_3dgsim": [folder / "genesis", "--fps", "25"],
         "import_physdreamer": [folder / "hat", "--anchor", "0.4", "--video-masks", folder / "video_masks"],
         "poses-mapping": [
-            "--images",
-            folder / "room",
-            "--camera-model",
-            "SIMPLE_PINHOLE",
-            "--features",
-            "1500",
-            "--feature-size",
-            "320",
+            "--images", folder / "room", *"--camera-model SIMPLE_PINHOLE --features 1500 --feature-size 320".split(),
         ],
         "synthesize": "--quick --objects pudding_soft --sequences 1 --frames 16 --resolution 24 --kernels 60 "
         "--workers 1".split(),
         "corpus": "--bodies 2 --sequences 1 --frames 4 --kernels 60 60 --second 0 --workers 1".split(),
-    }
+    }  # fmt: skip
 
     class Made(dict):
         """Makes a stage, and those whose results it reads, when it is asked for."""
@@ -106,7 +85,7 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
             if stage in public:
                 public[stage]()
             argv = [str(value) for value in arguments[stage]]
-            done = run(stage, [*argv, "--out", str(whole[stage])])
+            done = run(stage=stage, argv=[*argv, "--out", str(whole[stage])])
             assert done["status"] == 0, done["output"]
             self[stage] = (argv, whole[stage], done["places"])
             return self[stage]
@@ -121,11 +100,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 def check(run: Run, stage: str, argv: list[str], whole: Path, places: int, share: float, folder: Path) -> None:
     out = folder / "result"
     command = [*argv, "--out", str(out)]
-    killed = run(stage, command, die=min(places - 1, round(share * (places - 1))))
+    killed = run(stage=stage, argv=command, die=min(places - 1, round(share * (places - 1))))
     assert killed["status"] == -signal.SIGKILL, killed["output"]
     if out.exists():  # killed after it had taken its name: then it is whole
         assert contents(out) == contents(whole)
-    again = run(stage, command)
+    again = run(stage=stage, argv=command)
     assert again["status"] == 0, again["output"]
     assert contents(out) == contents(whole)
     assert [p.name for p in folder.iterdir()] == ["result"]  # nothing is left lying about
@@ -151,14 +130,14 @@ def test_every_place_near_the_end_of_a_stage(run: Run, jobs: dict, tmp_path: Pat
         check(run, "pack", argv, whole, places, place / (places - 1), tmp_path / f"new_{place}")
     for back in range(1, 8):
         folder = tmp_path / f"force_{back}"
-        assert run("pack", [*argv, "--margin", "0", "--out", str(folder / "result")])["status"] == 0
+        assert run(stage="pack", argv=[*argv, "--margin", "0", "--out", str(folder / "result")])["status"] == 0
         before = contents(folder / "result")
         command = [*argv, "--force", "--out", str(folder / "result")]
         # A replacement passes one place more than a first result: the old one steps aside.
-        killed = run("pack", command, die=places + 1 - back)
+        killed = run(stage="pack", argv=command, die=places + 1 - back)
         assert killed["status"] == -signal.SIGKILL
         if (folder / "result").exists():
             assert contents(folder / "result") in (before, contents(whole))
-        assert run("pack", command)["status"] == 0 and run("pack", command)["status"] == 0
+        assert [run(stage="pack", argv=command)["status"] for _ in range(2)] == [0, 0]
         assert contents(folder / "result") == contents(whole) and verify(folder / "result") == []
         assert [p.name for p in folder.iterdir()] == ["result"]

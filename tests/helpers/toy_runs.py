@@ -26,18 +26,21 @@ TINY = (
 )  # fmt: skip
 
 
-class Server:
-    """The program ``killed_runs.py``, which starts when it is first needed."""
+TESTS = Path(__file__).parents[1]
 
-    def __init__(self) -> None:
+
+class Server:
+    """A program that answers each line of JSON by another, and starts when it is first needed."""
+
+    def __init__(self, program: Path = TESTS / "helpers" / "killed_runs.py") -> None:
+        self._program = program
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, **order: Any) -> Any:
         if self._process is None:
-            here = Path(__file__)
-            path = os.pathsep.join([str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+            path = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
             self._process = subprocess.Popen(
-                [sys.executable, str(here.with_name("killed_runs.py"))], stdin=subprocess.PIPE,
+                [sys.executable, str(self._program)], stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path},
             )  # fmt: skip
         assert self._process.stdin is not None and self._process.stdout is not None
