@@ -7,12 +7,10 @@ import shutil
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import torch
@@ -51,7 +49,7 @@ from gausim.io.ply import load_masks, load_points, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
 from gausim.io.transforms import read_json, read_transforms, write_transforms
-from gausim.io.video import read_video, video_rate
+from gausim.io.video import read_video, video_rate, write_video
 from gausim.results.summary import SCHEMA, load_summary
 from gausim.runs.directory import RunDirectory
 
@@ -334,14 +332,7 @@ def _films(folder: Path) -> Iterator[Reader]:
     place.mkdir()
     for suffix in ("mp4", "mkv"):
         path = place / f"film.{suffix}"
-        with av.open(str(path), "w") as film:
-            video = film.add_stream("libx264", rate=Fraction(25))
-            video.width, video.height, video.pix_fmt = 32, 24, "yuv420p"
-            video.options = {"preset": "ultrafast"}
-            for k in range(5):
-                pixels = np.full((24, 32, 3), 40 * k, np.uint8)
-                film.mux(video.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
-            film.mux(video.encode())
+        write_video(path, [np.full((24, 32, 3), 40 * k, np.uint8) for k in range(5)], 25)
 
         def ingested(p: Path) -> Any:
             found = probe(p)

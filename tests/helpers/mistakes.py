@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from gausim.io.ply import masks_path
+from gausim.io.video import write_video
 from helpers.plain import edit_json
 
 Json = dict
@@ -134,19 +135,10 @@ def not_at_rest(root: Path) -> None:
 
 
 def film_for_frames(root: Path) -> None:
-    """The folder holds the camera's HEVC film under the name of the first frame."""
-    import av
-
+    """The folder holds the camera's film under the name of the first frame."""
     path = sorted(root.glob("sequences/*/*/*.png"))[0]
-    height, width = cv2.imread(str(path)).shape[:2]
     film = path.with_suffix(".mp4")
-    with av.open(str(film), "w") as container:
-        stream = container.add_stream("libx265" if "libx265" in av.codecs_available else "libx264", rate=24)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for _ in range(4):
-            frame = av.VideoFrame.from_ndarray(np.zeros((height, width, 3), np.uint8), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    write_video(film, [np.zeros_like(cv2.imread(str(path)))] * 4, 24)
 
     def change(data: Json) -> None:
         for entry in data["frames"]:

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_prep.public.pictures import resized
+from gausim.io.ply import save_scene
+from gausim.io.video import write_video
 from helpers import colmap_files, toy_object
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -293,8 +294,6 @@ def write_3dgsim(root: Path, *, samples: tuple[str, ...] = ("0001", "0002"), mov
 
 def write_physdreamer(root: Path) -> toy_object.ToyObject:
     """One object, `physics_dreamer/<obj>/`: COLMAP stills, a film from the second still's place, clouds."""
-    from gausim.io.ply import save_scene
-
     scene = toy_object.toy_scene()
     toy = toy_object.ToyObject(root, scene, frames=FRAMES)
     views = toy.views
@@ -306,7 +305,7 @@ def write_physdreamer(root: Path) -> toy_object.ToyObject:
     for i in range(3):
         save(root / "images" / f"frame_0000{i + 1}.png", frames[0, i, ..., :3])
         save(root / "masks" / f"frame_0000{i + 1}_mask.png", frames[0, i, ..., 3])
-    film(root / "videos" / "frame_00002_poke.mp4", frames[:, 1, ..., :3])
+    write_video(root / "videos" / "frame_00002_poke.mp4", frames[:, 1, ..., :3], 30, quality=1)
     for f in range(len(frames)):
         save(root.parent / "video_masks" / f"{f:04d}.png", frames[f, 1, ..., 3])
     save_scene(scene, root / "point_cloud.ply")
@@ -334,17 +333,6 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
     header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     path.write_text(header + "\n".join(" ".join(map(repr, map(float, p))) for p in points) + "\n")
-
-
-def film(path: Path, frames: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], "yuv444p"
-        stream.options = {"preset": "ultrafast", "crf": "1"}
-        for frame in frames:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
-        file.mux(stream.encode())
 
 
 def colmap_pose(viewmat: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
