@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.blender.environment import Blender, default_environment, find_blender
+from data_prep.blender.environment import BlenderProcess, default_environment, find_blender
 from data_prep.blender.plan import Pictures, Plan, Soft
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
@@ -28,7 +28,7 @@ def make_set(
     mesh: Path,
     out: Path,
     plan: Plan,
-    connect: Callable[[], Blender],
+    connect: Callable[[], BlenderProcess],
     *,
     workers: int = 1,
     force: bool = False,

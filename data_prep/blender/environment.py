@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 from gausim.core import ConfigError, DataError, GausSimError
 from gausim.io.files import write_durably
@@ -37,16 +37,6 @@ class BlenderError(GausSimError):
     """Blender cannot be installed or started, or gave up on a job."""
 
 
-class Blender(Protocol):
-    """Interface of Blender that the stage uses."""
-
-    def versions(self) -> dict[str, str]:
-        """Versions of bpy, numpy and Python, which decide what comes out."""
-
-    def run(self, job: Mapping[str, Any], told: Callable[[str], None], stop: threading.Event) -> None:
-        """Does a job of ``data_prep.blender.plan``; calls ``told`` at each step, gives up when ``stop`` is set."""
-
-
 Runner = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -59,7 +49,7 @@ class BlenderProcess:
     cores: SimpleQueue[int] = field(default_factory=lambda: _cores(), repr=False)
 
     def versions(self) -> dict[str, str]:
-        """See :class:`Blender`.
+        """Versions of bpy, numpy and Python, which decide what comes out.
 
         Raises:
             BlenderError: bpy cannot be loaded by this Python.
@@ -78,7 +68,12 @@ class BlenderProcess:
         return {name: str(value) for name, value in found.items()}
 
     def run(self, job: Mapping[str, Any], told: Callable[[str], None], stop: threading.Event) -> None:
-        """See :class:`Blender`; one process per job, which ends when this one does.
+        """Does a job of ``data_prep.blender.plan`` in a process of its own, which ends when this one does.
+
+        Args:
+            job: plain data.
+            told: called at each step.
+            stop: when set, the job is given up.
 
         Raises:
             BlenderError: with what Blender said last.

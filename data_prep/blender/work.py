@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from data_prep.blender.environment import Blender, BlenderError
+from data_prep.blender.environment import BlenderError, BlenderProcess
 from data_prep.blender.meshes import read_mesh
 from data_prep.blender.plan import (
     FPS,
@@ -44,7 +44,9 @@ STILLS_PER_JOB = 20
 OVERVIEW_FRAMES, OVERVIEW_SIDE = 5, 200
 
 
-def make_images(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers: int, tick: Tick) -> dict[str, Any]:
+def make_images(
+    mesh: Path, work: Path, plan: Plan, blender: BlenderProcess, *, workers: int, tick: Tick
+) -> dict[str, Any]:
     """Makes what is missing of a set in ``work``.
 
     Returns:
@@ -90,7 +92,7 @@ def _start(root: Path, facts: Mapping[str, Any]) -> None:
     write_json(root / FACTS, facts)
 
 
-def _run(jobs: list[dict[str, Any]], blender: Blender, workers: int, tick: Tick) -> None:
+def _run(jobs: list[dict[str, Any]], blender: BlenderProcess, workers: int, tick: Tick) -> None:
     """Does the jobs, those of interrupted work only in part, several at a time; the first error ends all."""
     stop = threading.Event()
     total = sum(len(job["images"]) for job in jobs)
@@ -125,7 +127,7 @@ def _is_there(path: Path) -> bool:
     return path.is_file() and path.stat().st_size > 0
 
 
-def _do(job: dict[str, Any], blender: Blender, told: Callable[[str], None], stop: threading.Event) -> None:
+def _do(job: dict[str, Any], blender: BlenderProcess, told: Callable[[str], None], stop: threading.Event) -> None:
     blender.run(job, told, stop)
     rest = _left(job)
     if rest is not None:
