@@ -279,21 +279,17 @@ def test_sam2_says_what_is_missing(film: Path, tmp_path: Path, capsys: Any, monk
     assert main([*command, "--sam2-checkpoint", "w.pt"]) == 2 and "--box, --point" in capsys.readouterr().err
     assert main([*command, "--sam2-checkpoint", "w.pt", "--box", "9,9,2,2"]) == 2
     assert "x0 < x1" in capsys.readouterr().err
+    assert main([*command, "--sam2-checkpoint", "w.pt", "--point", "9,9,1"]) == 2
+    assert "package sam2" in capsys.readouterr().err
     with pytest.raises(DataError, match="prompts: none for 'sequences/seq_000/cam_0'"):
         segment(film, tmp_path / "out", sam2(FakePredictor(), {"cam_7": Prompt((0, 0, 9, 9))}), Cleanup())
     with pytest.raises(DataError, match="lie outside"):
         segment(film, tmp_path / "out", sam2(FakePredictor(), {"": Prompt((0, 0, 900, 9))}), Cleanup())
     with pytest.raises(DataError, match="gave no mask of this picture"):
         segment(film, tmp_path / "out", sam2(FakePredictor(upset=True), {"": Prompt((4, 24, 28, 48))}), Cleanup())
-    for box, points in (
-        (None, []),
-        (None, [(1, 2, 0)]),
-        ([1, 2, float("nan"), 4], []),
-        ([1, 2], []),
-        (None, [(1, 2, 7)]),
-    ):
+    for box, points in ((None, []), (None, [(1, 2, 0)]), ([1, 2, np.nan, 4], []), ([1, 2], []), (None, [(1, 2, 7)])):
         with pytest.raises(DataError, match="box"):
-            make_prompt(box, points, "here")
+            make_prompt({"box": box, "points": points}, "here")
 
 
 def test_sam2_reads_checkpoints_without_running_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -141,7 +141,7 @@ def _sam2(chosen: TrackerOptions) -> Backend:
         raise ConfigError("--backend sam2: name the weights with --sam2-checkpoint FILE.")
     prompts = read_prompts(chosen.prompts) if chosen.prompts else {}
     if chosen.box or chosen.point:
-        prompts[""] = make_prompt(chosen.box, chosen.point, "--box, --point")
+        prompts[""] = make_prompt({"box": chosen.box, "points": chosen.point}, "--box, --point")
     if not prompts:
         raise ConfigError("--backend sam2: say where the object is, with --box, --point or --prompts.")
     predictor = load_predictor(chosen.sam2_checkpoint, chosen.sam2_config, device=chosen.device)

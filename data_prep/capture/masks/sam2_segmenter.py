@@ -8,48 +8,34 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
+from msgspec import Struct
 
 from data_prep.capture.masks.clips import Clip
 from data_prep.capture.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
-from gausim.io.plain_json import parse_json
+from gausim.io.plain_json import checked
 
 # The predictor reads JPEG files only; at this quality they differ from the frames by less than a camera's noise.
 JPEG_QUALITY = 98
 
 
-@dataclass(frozen=True)
-class Prompt:
+class Prompt(Struct, frozen=True, forbid_unknown_fields=True):
     """Point or box of the object in the first picture of a clip [pixels]."""
 
     box: tuple[float, float, float, float] | None = None  # left, top, right, bottom; None without
-    points: tuple[tuple[float, float, int], ...] = ()  # x, y and 1 for object or 0 for background
-
-
-class VideoPredictor(Protocol):
-    """Interface of ``sam2.sam2_video_predictor.SAM2VideoPredictor``, as far as it is used."""
-
-    def init_state(self, video_path: str, offload_video_to_cpu: bool = ...) -> Any:
-        """Reads a folder of JPEG files 00000.jpg and so on."""
-
-    def add_new_points_or_box(self, inference_state: Any, frame_idx: int, obj_id: int, **prompt: Any) -> Any:
-        """Takes ``points``, ``labels`` and ``box`` on a frame."""
-
-    def propagate_in_video(self, inference_state: Any) -> Iterator[tuple[int, list[int], Any]]:
-        """Yields frame index, object numbers, and logits (objects, 1, H, W)."""
+    points: tuple[tuple[float, float, float], ...] = ()  # x, y and 1 for object or 0 for background
 
 
 class Sam2Segmenter:
     """SAM 2's video predictor behind the protocol of :class:`data_prep.capture.masks.segmenters.Segmenter`."""
 
-    def __init__(self, predictor: VideoPredictor, prompts: Mapping[str, Prompt], *, device: str = "cpu") -> None:
-        """Takes a predictor and prompts."""
+    def __init__(self, predictor: Any, prompts: Mapping[str, Prompt], *, device: str = "cpu") -> None:
+        """Takes a ``sam2.sam2_video_predictor.SAM2VideoPredictor`` and prompts by clip."""
         self._predictor, self._prompts, self._device = predictor, prompts, device
 
     def open(self, clip: Clip) -> MaskOf:
@@ -99,7 +85,7 @@ class Sam2Segmenter:
         return torch.autocast("cuda", dtype=torch.bfloat16) if self._device.startswith("cuda") else nullcontext()
 
 
-def load_predictor(checkpoint: Path, config: str, *, device: str) -> VideoPredictor:
+def load_predictor(checkpoint: Path, config: str, *, device: str) -> Any:
     """SAM 2's video predictor with the weights of a local checkpoint, read without pickles of code.
 
     Raises:
@@ -129,8 +115,7 @@ def load_predictor(checkpoint: Path, config: str, *, device: str) -> VideoPredic
         predictor.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(f"{checkpoint}: does not fit the configuration '{config}' ({error}).") from error
-    found: VideoPredictor = predictor
-    return found
+    return predictor
 
 
 def read_prompts(path: Path) -> dict[str, Prompt]:
@@ -139,36 +124,26 @@ def read_prompts(path: Path) -> dict[str, Prompt]:
     Raises:
         DataError: the file is missing or malformed.
     """
-    try:
-        data = parse_json(path.read_bytes())
-        return {
-            str(name): make_prompt(entry.get("box"), entry.get("points", []), f"{path}: '{name}'")
-            for name, entry in data.items()
-        }
-    except (OSError, ValueError, AttributeError) as error:
-        raise DataError(f"{path}: cannot be read as prompts ({error}).") from error
+    from gausim.io.transforms import read_json  # loads torch
+
+    return {name: make_prompt(entry, f"{path}: '{name}'") for name, entry in read_json(path).items()}
 
 
-def make_prompt(box: Any, points: Any, where: str) -> Prompt:
-    """A checked prompt from lists of numbers.
+def make_prompt(given: Any, where: str) -> Prompt:
+    """A checked prompt from plain data.
 
     Raises:
         DataError: numbers are missing, not finite, or not in order.
     """
-    try:
-        corners = None if box is None else tuple(float(v) for v in box)
-        marks = tuple((float(x), float(y), int(label)) for x, y, label in points)
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            f"{where}: expected a box [x0, y0, x1, y1] and points [[x, y, 1 or 0]], got {error}."
-        ) from error
-    numbers = [*(corners or ()), *(v for mark in marks for v in mark)]
-    fits = corners is None or (len(corners) == 4 and corners[0] < corners[2] and corners[1] < corners[3])
-    if not np.isfinite(numbers).all() or not fits or any(label not in (0, 1) for *_, label in marks):
-        raise DataError(f"{where}: expected a box x0 < x1, y0 < y1 and labels 0 or 1, got {box} and {points}.")
-    if corners is None and not any(label == 1 for *_, label in marks):
+    prompt = checked(given, Prompt, where, "Expected a box [x0, y0, x1, y1] and points [[x, y, 1 or 0]].")
+    x0, y0, x1, y1 = prompt.box or (0.0, 0.0, 1.0, 1.0)
+    numbers = [x0, y0, x1, y1, *(v for mark in prompt.points for v in mark)]
+    labels = [label for *_, label in prompt.points]
+    if not np.isfinite(numbers).all() or not (x0 < x1 and y0 < y1) or not set(labels) <= {0, 1}:
+        raise DataError(f"{where}: expected finite numbers, a box x0 < x1, y0 < y1 and labels 0 or 1, got {given}.")
+    if prompt.box is None and not any(labels):
         raise DataError(f"{where}: needs a box, or a point on the object.")
-    return Prompt(corners, marks)  # type: ignore[arg-type]  # its length was checked
+    return prompt
 
 
 def _fitting(prompt: Prompt | None, clip: Clip, width: int, height: int) -> Prompt:
