@@ -41,17 +41,14 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
 
 
 def _of_transforms(path: Path) -> dict[str, np.ndarray]:
-    from gausim.io.transforms import read_json, viewmat_of
+    from gausim.io.transforms import read_entries, read_json, viewmat_of
 
-    entries = read_json(path).get("frames")
-    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-        raise DataError(f"{path}: field 'frames' must be a list of objects.")
     poses = {}
-    for i, entry in enumerate(entries):
+    for where, entry in read_entries(read_json(path), path):
         name = entry.get("source", entry.get("file_path"))
         if not isinstance(name, str) or name in poses:
-            raise DataError(f"{path}: frames[{i}]: field 'file_path' must name an image once, got {name!r:.80}.")
-        poses[name] = viewmat_of(entry, f"{path}: frames[{i}]").double().numpy()
+            raise DataError(f"{where}: field 'file_path' must name an image once, got {name!r:.80}.")
+        poses[name] = viewmat_of(entry, where).double().numpy()
     return _by_stem(poses, path)
 
 

@@ -96,13 +96,8 @@ def _views(root: Path, data: Any) -> tuple[View, ...]:
     ks = field(data, "intrinsics", list, where)
     width, height = field(data, "WH", tuple[int, int], where)
     poses = read_pickle(root / POSES)
-    found = (
-        poses
-        if isinstance(poses, list | tuple)
-        else list(poses)
-        if isinstance(poses, np.ndarray) and poses.ndim == 3
-        else []
-    )
+    several = isinstance(poses, list | tuple) or (isinstance(poses, np.ndarray) and poses.ndim == 3)
+    found = list(poses) if several else []
     if not found or len(found) != len(ks):
         raise DataError(
             f"{root / POSES}: expected a list of {len(ks)} poses, one per camera of {META}, got {len(found)}."

@@ -85,21 +85,18 @@ def read_lens_transforms(path: Path) -> list[Posed]:
             the lens is of a model that cannot be straightened.
     """
     from gausim.core import Cameras
-    from gausim.io.transforms import image_name, pinhole_of, read_json, viewmat_of
+    from gausim.io.transforms import image_name, pinhole_of, read_entries, read_json, size_field, viewmat_of
 
     data = read_json(path)
-    entries = data.get("frames")
-    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-        raise DataError(f"{path}: field 'frames' must be a non-empty list of objects.")
     posed, names = [], set()
-    for i, entry in enumerate(entries):
-        where, fields = f"{path}: frames[{i}]", {**data, **entry}
+    for where, entry in read_entries(data, path):
+        fields = {**data, **entry}
         name = image_name(entry, where)
         if name in names:
             raise DataError(f"{where}: field 'file_path' '{name}' stands twice.")
         names.add(name)
         photo = open_photo(path.parent / name, name.removeprefix("./"))
-        size = _size(fields, photo, where)
+        size = size_field(fields, where) or (photo.width, photo.height)
         k = pinhole_of(fields, size, where)
         viewmat = viewmat_of(entry, where)
         Cameras(viewmat[None], k[None], *size, (name,)).validated(str(path))
@@ -107,17 +104,6 @@ def read_lens_transforms(path: Path) -> list[Posed]:
         empty = np.empty(0, np.int64)
         posed.append(Posed(photo, fitted(camera, photo), viewmat.double().numpy(), np.empty((0, 2)), empty))
     return posed
-
-
-def _size(fields: dict[str, Any], photo: Photo, where: str) -> tuple[int, int]:
-    from gausim.io.transforms import number_field
-
-    if "w" not in fields and "h" not in fields:
-        return photo.width, photo.height
-    size = int(number_field(fields, "w", where)), int(number_field(fields, "h", where))
-    if min(size) < 1:
-        raise DataError(f"{where}: fields 'w', 'h' must be positive, got {size}.")
-    return size
 
 
 def _lens(fields: dict[str, Any], k: np.ndarray, size: tuple[int, int], where: str) -> ColmapCamera:

@@ -57,15 +57,12 @@ def read_transforms(path: Path) -> PosedImages:
             or a pose is not a rotation plus a translation.
     """
     data = read_json(path)
-    entries = data.get("frames")
-    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-        raise DataError(f"{path}: field 'frames' must be a non-empty list of objects.")
     size: tuple[int, int] | None = None
     frames, viewmats, intrinsics = [], [], []
-    for i, entry in enumerate(entries):
-        fields, field = {**data, **entry}, f"{path}: frames[{i}]"
+    for field, entry in read_entries(data, path):
+        fields = {**data, **entry}
         frames.append(_frame(path.parent, entry, field))
-        here = _size(fields, frames[-1].path, field, fallback=size)
+        here = size_field(fields, field) or size or _size_of(frames[-1].path, field)
         size = size or here
         if here != size:
             raise DataError(f"{field}: is {here[0]}x{here[1]}, frames[0] is {size[0]}x{size[1]}; use one image size.")
@@ -116,6 +113,18 @@ def read_json(path: Path) -> dict[str, Any]:
     return data
 
 
+def read_entries(data: dict[str, Any], path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The entries of ``frames``, each with its place for messages.
+
+    Raises:
+        DataError: there are none, or one is no object.
+    """
+    entries = data.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise DataError(f"{path}: field 'frames' must be a non-empty list of objects.")
+    return [(f"{path}: frames[{i}]", entry) for i, entry in enumerate(entries)]
+
+
 def number_field(fields: dict[str, Any], key: str, where: str) -> float:
     """A field that must be a finite number, or :class:`DataError` that names it."""
     value = fields.get(key)
@@ -155,14 +164,21 @@ def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
     return PosedFrame(path, str(entry.get("camera", path.parent.name)), number, bool(entry.get("heldout", False)))
 
 
-def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[int, int] | None) -> tuple[int, int]:
-    if "w" in fields or "h" in fields:
-        size = int(number_field(fields, "w", field)), int(number_field(fields, "h", field))
-        if min(size) < 1:
-            raise DataError(f"{field}: fields 'w', 'h' must be positive, got {size}.")
-        return size
-    if fallback is not None:
-        return fallback
+def size_field(fields: dict[str, Any], field: str) -> tuple[int, int] | None:
+    """Width and height that ``w`` and ``h`` state [pixels]; None without them.
+
+    Raises:
+        DataError: one is missing, malformed or not positive.
+    """
+    if "w" not in fields and "h" not in fields:
+        return None
+    size = int(number_field(fields, "w", field)), int(number_field(fields, "h", field))
+    if min(size) < 1:
+        raise DataError(f"{field}: fields 'w', 'h' must be positive, got {size}.")
+    return size
+
+
+def _size_of(image: Path, field: str) -> tuple[int, int]:
     found = read_header(image)
     if found is None:
         raise DataError(f"{field}: has no 'w' and 'h', and {image} cannot be read to find them.")
