@@ -18,7 +18,10 @@ T = TypeVar("T", bound="Options")
 _TYPES: dict[str, type] = {"int": int, "float": float, "Path": Path, "tuple[float,": float, "tuple[int,": int}
 
 
-def option(default: Any, help: str, *, least: float = -math.inf, most: float = math.inf, **argument: Any) -> Any:
+def option(
+    default: Any, help: str, *, least: float = -math.inf, most: float = math.inf, interval: bool = False,
+    **argument: Any,
+) -> Any:  # fmt: skip
     """A field of an :class:`Options` that is an option of the command line.
 
     Args:
@@ -26,9 +29,13 @@ def option(default: Any, help: str, *, least: float = -math.inf, most: float = m
         help: text for the command line.
         least: smallest number that it may be.
         most: largest.
+        interval: it is two numbers, LOW and HIGH, the smaller one first.
         argument: of ``add_argument``, where the field's type does not say it.
     """
-    return field(default=default, metadata={"argument": {"help": help, **argument}, "range": (least, most)})
+    if interval:
+        argument = {"nargs": 2, "metavar": ("LOW", "HIGH"), **argument}
+    about = {"argument": {"help": help, **argument}, "range": (least, most), "interval": interval}
+    return field(default=default, metadata=about)
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,8 @@ class Options:
                 if isinstance(number, (int, float)) and not (math.isfinite(number) and least <= number <= most):
                     expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
                     raise ConfigError(f"{_flag(each.name)}: expected {expected}, got {number:g}.")
+            if each.metadata.get("interval") and value is not None and value[0] > value[1]:
+                raise ConfigError(f"{_flag(each.name)}: expected LOW <= HIGH, got {value[0]:g} {value[1]:g}.")
 
 
 def _flag(name: str) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from data_prep.common.command import Options, option
-from gausim.core.errors import ConfigError
 
 RATES = (24, 30, 60)  # frames per second
 PERIODS = (4.0, 40.0)  # of the slowest mode [frames]
@@ -28,22 +27,14 @@ class Plan(Options):
     sequences: int = option(4, "sequences per body (4)", least=1)
     frames: int = option(50, "frames per sequence (50)", least=2)
     kernels: tuple[int, int] = option(
-        (400, 800), "fewest and most kernels of a body (400 800)", least=50, nargs=2, metavar=("FEWEST", "MOST")
+        (400, 800), "fewest and most kernels of a body (400 800)", least=50, interval=True, metavar=("FEWEST", "MOST")
     )
     swing: tuple[float, float] = option(
         (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal] (0.02 0.3)", least=1e-3, most=0.4,
-        nargs=2, metavar=("LOW", "HIGH"),
+        interval=True,
     )  # fmt: skip
     second: float = option(0.2, "fraction of bodies that the material point method moves (0.2)", least=0, most=1)
     meshes: tuple[Path, ...] = option(
         (), "surfaces (OBJ or PLY), each as likely as a procedural kind of shape", nargs="+", metavar="FILE", type=Path
     )
     seed: int = option(0, "of everything random (0)", least=0)
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        super().__post_init__()
-        for name in ("kernels", "swing"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ConfigError(f"--{name}: expected two numbers in ascending order, got {low:g} {high:g}.")

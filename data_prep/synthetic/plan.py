@@ -95,7 +95,7 @@ class Plan(Options):
     kernels: int = option(800, "Gaussians per object, at least 50", least=50)
     swing: tuple[float, float] | None = option(
         None, "amplitude of all pushes [fractions of the object's diagonal]; each object's own unless given",
-        least=1e-9, most=LARGEST_SWING, nargs=2, metavar=("LOW", "HIGH"),
+        least=1e-9, most=LARGEST_SWING, interval=True,
     )  # fmt: skip
     seed: int = option(0, "of everything random (0)")
 
@@ -107,8 +107,6 @@ class Plan(Options):
             raise ConfigError(f"objects: no recipe for {unknown}; choose some of {', '.join(RECIPES)}.")
         if not 1 <= self.train_views <= MOST_TRAIN_VIEWS:
             raise ConfigError(f"train_views: expected 1..{MOST_TRAIN_VIEWS}, got {self.train_views}.")
-        if self.swing is not None and self.swing[0] > self.swing[1]:
-            raise ConfigError(f"--swing: expected LOW <= HIGH, got {self.swing}.")
 
     @property
     def views(self) -> tuple[str, ...]:
