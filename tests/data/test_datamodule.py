@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import lightning as L
 import pytest
 import torch
+from helpers.blob import make_object
 
 from gausim.core import ConfigError, DataError
 from gausim.data.curriculum import Curriculum
@@ -17,10 +18,10 @@ from gausim.training.ranks.ranks import interleave
 
 
 @pytest.fixture(scope="module")
-def two_objects(tmp_path_factory: pytest.TempPathFactory, tiny: SimpleNamespace) -> Path:
+def two_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("set")
-    tiny.object(root / "apple", name="apple", sequences=2)
-    tiny.object(root / "pear", name="pear", sequences=3)
+    make_object(root / "apple", name="apple", sequences=2)
+    make_object(root / "pear", name="pear", sequences=3)
     return root
 
 

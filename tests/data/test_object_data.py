@@ -4,27 +4,26 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.blob import FRAMES, POINTS, VIEWS, frame_pixels
+from helpers.plain import edit_json
+from helpers.toy_object import surround
 
 from gausim.compose.config import compose
 from gausim.core import ConfigError, DataError, SceneError
-from gausim.data.images import composite
+from gausim.data.images import composite, write_rgba
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
 
-VIEWS = ("cam_0", "cam_1", "cam_2")
-FRAMES, POINTS = 20, 5  # of tests/data/conftest.py
 
-
-def test_frames_are_those_of_the_files_in_the_order_asked_for(blob: Path, tiny: SimpleNamespace) -> None:
+def test_frames_are_those_of_the_files_in_the_order_asked_for(blob: Path) -> None:
     record = ObjectData(blob).sequences[1]
     frames = record.frames(range(4, 7), ["cam_2", "cam_0"])
-    expected = [[tiny.pixels(1, v, f) for v in (2, 0)] for f in (4, 5, 6)]
+    expected = [[frame_pixels(1, v, f) for v in (2, 0)] for f in (4, 5, 6)]
     assert torch.equal(frames, torch.from_numpy(np.array(expected)))
     assert record.cameras_of(["cam_2", "cam_0"]).names == ("cam_2", "cam_0")
     assert torch.equal(record.cameras_of(["cam_2"]).viewmats[0], record.cameras.viewmats[2])
@@ -40,13 +39,8 @@ def test_a_frame_is_decoded_once(blob: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert torch.equal(record.frames(range(3), ["cam_0"]), first), "samples must not share memory with the store"
 
 
-def _state(root: Path, **facts: object) -> None:
-    path = root / "dataset.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **facts}))
-
-
 def test_surroundings_are_those_of_the_facts(spoilt: Path) -> None:
-    _state(spoilt, free=True, gravity="trained", floor={"point": [0, 0, 1], "normal": [0, 0, 2]})
+    surround(spoilt, free=True, gravity="trained", floor={"point": [0, 0, 1], "normal": [0, 0, 2]})
     world = ObjectData(spoilt).surroundings
     assert world.free and world.trains_gravity and world.gravity is None and not world.still
     assert world.floor is not None and world.floor.normal == (0.0, 0.0, 1.0) and world.floor.friction is None
@@ -65,7 +59,7 @@ def test_surroundings_are_those_of_the_facts(spoilt: Path) -> None:
     ],
 )
 def test_wrong_surroundings_are_refused(spoilt: Path, facts: dict[str, object], message: str) -> None:
-    _state(spoilt, **facts)
+    surround(spoilt, **facts)
     with pytest.raises(DataError, match=rf"dataset\.json.*{message}"):
         ObjectData(spoilt)
 
@@ -80,7 +74,7 @@ def _hold(root: Path, **changed: object) -> None:
 
 def test_kernels_near_a_hand_are_pinned_to_it(spoilt: Path) -> None:
     _hold(spoilt)
-    _state(spoilt, grip=1e-6)
+    surround(spoilt, grip=1e-6)
     item = ObjectData(spoilt)
     scene, path = item.scene(), item.sequences[0].hands
     assert scene.hand is not None and (scene.hand[0], scene.hand[-1]) == (0, 1)
@@ -108,7 +102,7 @@ def test_wrong_hands_are_refused(spoilt: Path, changed: dict[str, object], messa
 
 def test_a_hand_that_holds_nothing_is_refused(spoilt: Path) -> None:
     _hold(spoilt, points=np.full((FRAMES, 2, 3), 99.0))
-    _state(spoilt, grip=0.1)
+    surround(spoilt, grip=0.1)
     with pytest.raises(DataError, match="'grip' is 0.1: hand 0 holds none"):
         ObjectData(spoilt).scene()
 
@@ -123,10 +117,10 @@ def test_facts_and_true_motion(blob: Path) -> None:
     assert torch.equal(truth.rest, item.scene().means)
 
 
-def test_stills_are_split(blob: Path, tiny: SimpleNamespace) -> None:
+def test_stills_are_split(blob: Path) -> None:
     stills = ObjectData(blob).stills()
     assert stills.images.shape == (12, 6, 8, 4) and stills.heldout == (9,) and len(stills.train) == 11
-    assert torch.equal(stills.images[5], torch.from_numpy(tiny.pixels(0, 0, 5)))
+    assert torch.equal(stills.images[5], torch.from_numpy(frame_pixels(0, 0, 5)))
     assert torch.equal(read_stills(blob / "static" / "transforms.json").images, stills.images)
 
 
@@ -168,19 +162,19 @@ def _without_a_view(data: dict) -> None:
         (lambda data: data.update(fps=30), "'fps' is 30, dataset.json says 24"),
     ],
 )
-def test_wrong_cameras_of_a_sequence(spoilt: Path, tiny: SimpleNamespace, edit: Callable, message: str) -> None:
-    tiny.edit(spoilt / SEQUENCE / "transforms.json", edit)
+def test_wrong_cameras_of_a_sequence(spoilt: Path, edit: Callable, message: str) -> None:
+    edit_json(spoilt / SEQUENCE / "transforms.json", edit)
     with pytest.raises(DataError, match=message):
         _ = ObjectData(spoilt).sequences
 
 
-def test_wrong_images(spoilt: Path, tiny: SimpleNamespace) -> None:
+def test_wrong_images(spoilt: Path) -> None:
     folder, record = spoilt / SEQUENCE / "cam_0", ObjectData(spoilt).sequences[0]
-    cv2.imwrite(str(folder / "0000.png"), tiny.pixels(0, 0, 0).astype(np.uint16))
+    cv2.imwrite(str(folder / "0000.png"), frame_pixels(0, 0, 0).astype(np.uint16))
     (folder / "0001.png").write_bytes(b"no image")
     (folder / "0002.png").unlink()
-    cv2.imwrite(str(folder / "0003.png"), tiny.pixels(0, 0, 2)[..., :3].copy())
-    tiny.png(folder / "0004.png", tiny.pixels(0, 0, 4)[:4, :4])
+    cv2.imwrite(str(folder / "0003.png"), frame_pixels(0, 0, 2)[..., :3].copy())
+    write_rgba(folder / "0004.png", frame_pixels(0, 0, 4)[:4, :4])
     expected = (r"got 8x6 RGBA \(16 bit\)", "cannot be decoded", "no such image", "got 8x6 RGB .*with alpha",
                 r"expected 8x6 RGBA \(8 bit\), got 4x4 RGBA")  # fmt: skip
     for frame, message in enumerate(expected):
@@ -199,8 +193,8 @@ def test_wrong_images(spoilt: Path, tiny: SimpleNamespace) -> None:
         ("train_frames", [0, 40], "has 20 frames, dataset.json trains on"),
     ],
 )
-def test_wrong_facts(spoilt: Path, field: str, value: object, message: str, tiny: SimpleNamespace) -> None:
-    tiny.edit(spoilt / "dataset.json", lambda d: d.update({field: value}))
+def test_wrong_facts(spoilt: Path, field: str, value: object, message: str) -> None:
+    edit_json(spoilt / "dataset.json", lambda d: d.update({field: value}))
     with pytest.raises(DataError, match=message):
         _ = ObjectData(spoilt).sequences
 

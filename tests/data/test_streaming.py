@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.blob import make_object, ring_of_cameras
+from helpers.plain import edit_json
 
 from data_prep.pack import pack
 from gausim.core import Cameras
@@ -19,24 +21,24 @@ from gausim.io.packed import HEADER, PIXELS, Crop, header
 
 
 @pytest.fixture(scope="module")
-def mixed(tmp_path_factory: pytest.TempPathFactory, tiny: SimpleNamespace) -> Path:
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two objects; the second has other cameras, rate and lengths of sequences."""
     root = tmp_path_factory.mktemp("mixed")
-    tiny.object(root / "apple", name="apple", sequences=3)
-    pear = tiny.object(root / "pear", name="pear", sequences=2)
+    make_object(root / "apple", name="apple", sequences=3)
+    pear = make_object(root / "pear", name="pear", sequences=2)
 
     def fewer(data: dict) -> None:
         data.update(views=["cam_0", "cam_1"], train_views=["cam_0"], heldout_views=["cam_1"], fps=50,
                     train_frames=[0, 9])  # fmt: skip
 
-    tiny.edit(pear / "dataset.json", fewer)
+    edit_json(pear / "dataset.json", fewer)
     for number, count in enumerate((9, 14)):
 
         def shorter(data: dict, count: int = count) -> None:
             data["fps"] = 50
             data["frames"] = [f for f in data["frames"] if f["camera"] != "cam_2" and f["frame"] < count]
 
-        tiny.edit(pear / "sequences" / f"seq_{number:03d}" / "transforms.json", shorter)
+        edit_json(pear / "sequences" / f"seq_{number:03d}" / "transforms.json", shorter)
     return root
 
 
@@ -62,12 +64,12 @@ def test_reading_ahead_changes_nothing(mixed: Path) -> None:
         assert {last for batch in found for _, last in batch} == {number + 1}
 
 
-def test_memory_does_not_grow_with_the_set(tmp_path: Path, tiny: SimpleNamespace) -> None:
+def test_memory_does_not_grow_with_the_set(tmp_path: Path) -> None:
     """A packed set of ten batches: over three epochs no more than two of them are in memory."""
-    root = tiny.object(tmp_path / "large", sequences=1)
+    root = make_object(tmp_path / "large", sequences=1)
     sequences, frames, views, side = 10, 16, ("cam_0", "cam_1", "cam_2"), 160
     (root / "sequences" / "seq_000").rename(tmp_path / "small")
-    cameras = tiny.cameras(views, width=side, height=side)
+    cameras = ring_of_cameras(views, width=side, height=side)
     block = frames * 4 * side * side
     for number in range(sequences):
         _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side, block)
