@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.plain import contents
 
 from data_prep.blender import environment as blender_env
 from data_prep.blender.environment import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
@@ -84,10 +85,6 @@ class FakeBlender:
                 cv2.imwrite(str(path), picture)
             self.taken += 1
             told("image")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:

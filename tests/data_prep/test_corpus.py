@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.plain import contents
 from scipy import ndimage
 
 if importlib.util.find_spec("mujoco") is None or importlib.util.find_spec("warp") is None:
@@ -23,10 +24,6 @@ from data_prep.synthetic.embedding import Embedding
 from gausim.data.corpus import MANIFEST, Corpus
 
 TINY = "--sequences 1 --frames 6 --kernels 60 70 --workers".split()
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def beam(length: int, width: int) -> Body:

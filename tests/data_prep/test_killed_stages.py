@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from helpers import public_sets
+from helpers.plain import contents
 from helpers.toy_runs import Server
 
 from gausim.data.verify import verify
@@ -91,10 +92,6 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
             return self[stage]
 
     return Made()
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def check(run: Run, stage: str, argv: list[str], whole: Path, places: int, share: float, folder: Path) -> None:

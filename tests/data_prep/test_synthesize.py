@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.plain import contents
 
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed (extra 'synth')", allow_module_level=True)
@@ -42,15 +42,10 @@ def body(request: pytest.FixtureRequest) -> Body:
     return BODIES[request.param]()
 
 
-def digests(root: Path) -> dict[str, str]:
-    files = [p for p in sorted(root.rglob("*")) if p.is_file()]
-    return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
-
-
 def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> None:
     assert main([*TINY, "--out", str(tmp_path / "again"), "--objects", "pudding_soft"]) == 0
     assert main([*TINY, "--out", str(tmp_path / "other"), "--objects", "pudding_soft", "--seed", "1"]) == 0
-    first, again, other = (digests(p / "pudding_soft") for p in (made, tmp_path / "again", tmp_path / "other"))
+    first, again, other = (contents(p / "pudding_soft") for p in (made, tmp_path / "again", tmp_path / "other"))
     assert first == again and len(first) > 100
     motion = "sequences/seq_000/ground_truth.npz"
     assert first[motion] != other[motion] and first["scene.ply"] != other["scene.ply"]
@@ -188,4 +183,4 @@ def test_instability_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_worker_processes_write_the_same_set(made: Path, tmp_path: Path) -> None:
     arguments = [a if a != "1" else "2" for a in TINY]
     assert main([*arguments, "--out", str(tmp_path / "set")]) == 0
-    assert digests(tmp_path / "set") == digests(made)
+    assert contents(tmp_path / "set") == contents(made)

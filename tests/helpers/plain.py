@@ -41,6 +41,11 @@ def cameras_at(eyes: Tensor, at: Sequence[float], *, focal: float, size: int, na
     return Cameras(viewmats, k.repeat(len(eyes), 1, 1), size, size, tuple(names))
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """The bytes of all files in a folder, by name."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
 def edit_json(path: Path, change: Callable[[dict], object]) -> None:
     """Changes the JSON object in a file in its place."""
     data = json.loads(path.read_text())
