@@ -9,7 +9,7 @@ hold out whole samples, so all frames are trained on unless --train-frames says 
 
 from __future__ import annotations
 
-import string
+import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -32,7 +32,8 @@ DATA = "metadata.json"
 GENESIS_GRAVITY = 9.81
 # Segments of their renderer, once the background is 0.
 BACKGROUND, STATIC = 0, 3
-_PLACES = {"cam_ix": 0, "n_step": 0, "img_type": "rgb"}
+# A place of a template: numbers may have a width of one digit.
+_PLACE = re.compile(r"\{(img_type|(?:cam_ix|n_step)(?::0?[0-9]?d?)?)\}")
 _SAME = 1e-5
 
 
@@ -134,20 +135,9 @@ def _motion(sample: Path, name: str, segments: tuple[int, ...]) -> Motion:
 
 def _template(text: str, where: str) -> str:
     """A template of file names that has the fields of the layout and nothing else."""
-    try:
-        parts = [part for part in string.Formatter().parse(text) if part[1] is not None]
-    except ValueError as error:
-        raise DataError(f"{where}: {error}. Expected names with cam_ix, n_step and img_type in braces.") from error
-    for _, name, form, conversion in parts:
-        digits = (form or "").removesuffix("d")
-        if name not in _PLACES or conversion or (digits and not (digits.isdecimal() and int(digits[:4]) <= 9)):
-            raise DataError(f"{where}: expected cam_ix, n_step and img_type in braces, got {text!r:.80}.")
-    if {name for _, name, _, _ in parts} != set(_PLACES):
-        raise DataError(f"{where}: expected all of cam_ix, n_step and img_type in braces, got {text!r:.80}.")
-    try:
-        text.format(**_PLACES)
-    except ValueError as error:
-        raise DataError(f"{where}: {error}, got {text!r:.80}.") from error
+    named = {place.partition(":")[0] for place in _PLACE.findall(text)}
+    if named != {"cam_ix", "n_step", "img_type"} or re.search("[{}]", _PLACE.sub("", text)):
+        raise DataError(f"{where}: expected cam_ix, n_step and img_type in braces, got {text!r:.80}.")
     return text
 
 

@@ -167,14 +167,16 @@ GENESIS = (
     Damage("0001/metadata.json", put("n_steps", to=25), "rgb_0024.png", "0001"),
     Damage("0001/metadata.json", put("n_cams", to=4), "field 'cam_3'"),
     *(
-        Damage("0001/metadata.json", put("file_path_template", to=text), f"field 'file_path_template'{said}")
-        for text, said in {
-            "cam_{cam_ix}/{n_step}": "",
-            "{cam_ix.real}{n_step}{img_type}": "",
-            "{cam_ix}{n_step:99999999d}{img_type}": "",
-            "../{cam_ix}{n_step}{img_type}": "",
-            "{cam_ix}{n_step}{img_type": ": expected '}'",
-        }.items()
+        Damage("0001/metadata.json", put("file_path_template", to=text), "field 'file_path_template'")
+        for text in (
+            "cam_{cam_ix}/{n_step}",
+            "{cam_ix.real}{n_step}{img_type}",
+            "{cam_ix}{n_step}{img_type:04d}",
+            "{cam_ix}{n_step:99999999d}{img_type}",
+            "../{cam_ix}{n_step}{img_type}",
+            "{cam_ix}{n_step}{img_type",
+            "{cam_ix}{n_step!r}{img_type}",
+        )
     ),
     Damage("0001/metadata.json", put("cam_1", "extrinsics", to=times(-1)), "field 'cam_1.extrinsics'"),
     Damage("0001/metadata.json", put("cam_1", "intrinsics", 2, 2, to=2), "field 'cam_1.intrinsics'"),
