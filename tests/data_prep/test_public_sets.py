@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 import yaml
 from helpers import public_sets
 from helpers.public_sets import FRAMES, SEEN, Sample
@@ -41,7 +41,7 @@ def check_views(data: ObjectData, sample: Sample, *, tolerance: float = 40.0, so
     assert record.count == FRAMES and pixels.shape[1] == 3
     for frame in (0, 9, FRAMES - 1):
         points = np.concatenate((sample.path[frame], sample.path[frame] + 0.3 * sample.body.radii[:, None]))
-        places, _ = project(torch_of(points), record.cameras.viewmats, record.cameras.Ks)
+        places, _ = project(torch.from_numpy(points).float(), record.cameras.viewmats, record.cameras.Ks)
         for view in range(3):
             x, y = places[view].numpy().astype(int).T
             inside = (x >= 0) & (x < record.cameras.width) & (y >= 0) & (y < record.cameras.height)
@@ -52,12 +52,6 @@ def check_views(data: ObjectData, sample: Sample, *, tolerance: float = 40.0, so
             both = (truth[..., 3] > solid) & (pixels[frame, view, ..., 3] > solid)
             assert both.sum() > 0.7 * (truth[..., 3] > solid).sum()
             assert np.abs(pixels[frame, view][both].astype(float) - truth[both]).mean() < tolerance
-
-
-def torch_of(points: np.ndarray) -> Any:
-    import torch
-
-    return torch.from_numpy(points).float()
 
 
 def test_synthetic_falls_of_spring_gaus(springgaus: Sample, tmp_path: Path) -> None:
@@ -107,7 +101,7 @@ def test_real_captures_are_registered_by_silhouettes(
     data = ObjectData(tmp_path / "out")
     check_views(data, real)
     stills = read_stills(tmp_path / "out" / "static" / "transforms.json")
-    places, _ = project(torch_of(real.path[0]), stills.cameras.viewmats, stills.cameras.Ks)
+    places, _ = project(torch.from_numpy(real.path[0]).float(), stills.cameras.viewmats, stills.cameras.Ks)
     x, y = places.numpy().astype(int).transpose(2, 0, 1)
     alpha = np.take_along_axis(stills.images[..., 3].numpy().reshape(14, -1), y * 108 + x, 1)
     assert (alpha > 127).mean() > 0.8  # points of the films, seen in the stills
