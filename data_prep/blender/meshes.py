@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gausim.core import DataError
-from gausim.io.ply_elements import Element, read_elements
+from gausim.io.ply_elements import Element, positions, read_elements
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -96,10 +96,7 @@ def _read_ply(path: Path) -> tuple[Array, Indices]:
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     for element, columns in read_elements(path):
         if element.name == "vertex":
-            numbers = set(element.fields) - set(element.lists)
-            if not {"x", "y", "z"} <= numbers:
-                raise DataError(f"{path}: vertices have fields {sorted(numbers)}, expected x, y and z.")
-            vertices = np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], 1)
+            vertices = positions(path, element, columns)
         elif element.name == "face":
             triangles = _faces(path, element, columns)
     return vertices, triangles

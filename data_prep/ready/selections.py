@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gausim.core import DataError, GaussianScene, SceneError
 from gausim.io.npz import read_npz
-from gausim.io.ply import MASK_NAMES, load_points
+from gausim.io.ply import MASK_NAMES
+from gausim.io.ply_elements import positions, read_elements
 from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selection, parse_half_space
 
 # Syntax of a term, by its first word.
@@ -91,10 +92,8 @@ def read_points(path: Path) -> np.ndarray:
         DataError: the file is missing, malformed, empty or too large, or a number is not finite.
     """
     if path.suffix.lower() == ".ply":
-        try:
-            points = load_points(path)
-        except SceneError as error:
-            raise DataError(str(error)) from error
+        found = (positions(path, *part) for part in read_elements(path) if part[0].name == "vertex")
+        points = next(found, np.zeros(0))
     elif not path.is_file():
         raise DataError(f"{path}: no such file. Expected points as npz, ply or txt.")
     elif path.suffix.lower() == ".npz":

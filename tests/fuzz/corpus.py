@@ -35,6 +35,7 @@ from data_prep.pack import pack
 from data_prep.public.pickles import read_pickle
 from data_prep.ready.authors import read_pins
 from data_prep.ready.gathered import gather
+from data_prep.ready.selections import read_points
 from gausim.core.errors import GausSimError
 from gausim.data.corpus import Corpus
 from gausim.data.images import read_rgba, write_rgba
@@ -45,7 +46,7 @@ from gausim.interaction.selections import Ball, Kernels
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
 from gausim.io.motion import load_motion, motion_glb
-from gausim.io.ply import load_masks, load_points, load_scene, save_scene
+from gausim.io.ply import load_masks, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
 from gausim.io.transforms import read_json, read_transforms, write_transforms
@@ -94,7 +95,7 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     rows = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
     text.write_bytes(head + b"end_header\n" + rows.encode() + b"\n")
     yield Reader("scene, text", text, "text", load_scene)
-    yield Reader("points", text, "text", load_points)
+    yield Reader("points", text, "text", read_points)
     mesh = folder / "mesh.ply"
     mesh.write_bytes(
         b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"

@@ -68,19 +68,6 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     return load_masks(scene, side) if masks is not None or side.is_file() else scene
 
 
-def load_points(path: Path | str) -> np.ndarray:
-    """Positions (P, 3) float32 of a PLY's vertices (of point clouds, meshes, scenes).
-
-    Raises:
-        SceneError: naming the file and the property that is missing, malformed, NaN or infinite.
-    """
-    path = Path(path)
-    table = _read_vertices(path)
-    if not set(_POSITION) <= set(table):
-        raise SceneError(f"{path}: a property x, y or z is missing. Expected points.")
-    return _columns(path, table, list(_POSITION))
-
-
 def save_scene(
     scene: GaussianScene, path: Path | str, *, masks: bool = True, more: Mapping[str, Float[Tensor, " K"]] | None = None
 ) -> None:

@@ -71,6 +71,18 @@ def read_elements(path: Path) -> Iterator[tuple[Element, dict[str, Any]]]:
         yield element, columns
 
 
+def positions(path: Path, element: Element, columns: Mapping[str, Any]) -> np.ndarray:
+    """(N, 3) float64 of an element's fields x, y and z.
+
+    Raises:
+        DataError: one is missing or a list.
+    """
+    numbers = sorted(set(element.fields) - set(element.lists))
+    if not {"x", "y", "z"} <= set(numbers):
+        raise DataError(f"{path}: '{element.name}' has fields {numbers}, expected x, y and z.")
+    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], 1)
+
+
 def _header(path: Path, data: bytes) -> tuple[bool, list[Element], int]:
     """Whether it is a text, elements, and where their data start [bytes]."""
     if not data.startswith((b"ply\n", b"ply\r\n")):
