@@ -19,8 +19,8 @@ from data_prep.public.pickles import read_pickle
 from gausim.cli.main import main
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
-from gausim.data.records import read_array
 from gausim.io.motion import load_motion
+from gausim.io.npz import read_array
 from gausim.io.ply import load_masks, load_scene
 from gausim.io.trajectory import load_trajectory
 from gausim.io.transforms import read_json, read_transforms

@@ -37,7 +37,7 @@ from data_prep.common.stage import PLAN, files_in, write_npz
 from gausim.core import DataError
 from gausim.data.images import read_rgba
 from gausim.io.files import write_json
-from gausim.io.npz import read_npz
+from gausim.io.npz import read_array
 
 FACTS = "dataset.json"
 STILLS_PER_JOB = 20
@@ -170,17 +170,13 @@ def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) ->
 
 def _motion(path: Path, plan: Plan) -> tuple[float, np.ndarray]:
     """Strength of the push and the largest displacement (F,) of each frame [scene units]."""
-    try:
-        arrays = read_npz(path, ["displacement", "strength"])
-        displacement, strength = arrays["displacement"], float(arrays["strength"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: cannot be read ({error}). Remove it and run the command again.") from error
-    if displacement.ndim != 3 or len(displacement) != plan.frames or not np.isfinite(displacement).all():
+    displacement, strength = (read_array(path, name) for name in ("displacement", "strength"))
+    if displacement.ndim != 3 or len(displacement) != plan.frames or strength.shape:
         raise DataError(
-            f"{path}: field 'displacement' has shape {displacement.shape}, expected {plan.frames} finite frames. "
+            f"{path}: field 'displacement' has shape {displacement.shape}, expected {plan.frames} frames. "
             "Remove it and run the command again."
         )
-    return strength, np.linalg.norm(displacement, axis=-1).max(1)
+    return float(strength), np.linalg.norm(displacement, axis=-1).max(1)
 
 
 def _write_overview(root: Path, plan: Plan) -> None:

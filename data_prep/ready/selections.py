@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gausim.core import DataError, GaussianScene, SceneError
-from gausim.io.npz import read_npz
+from gausim.io.npz import read_array
 from gausim.io.ply import MASK_NAMES
 from gausim.io.ply_elements import positions, read_elements
 from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selection, parse_half_space
@@ -97,10 +97,7 @@ def read_points(path: Path) -> np.ndarray:
     elif not path.is_file():
         raise DataError(f"{path}: no such file. Expected points as npz, ply or txt.")
     elif path.suffix.lower() == ".npz":
-        try:
-            points = read_npz(path, ["points"]).get("points", np.zeros(0))
-        except ValueError as error:
-            raise DataError(f"{path}: cannot be read as npz ({error}).") from error
+        points = read_array(path, "points")
     else:
         points = _text_points(path)
     numeric = points.dtype.kind in "fiu"

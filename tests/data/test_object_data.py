@@ -88,7 +88,7 @@ def test_kernels_near_a_hand_are_pinned_to_it(spoilt: Path) -> None:
     ("changed", "message"),
     [
         ({"points": np.zeros((3, 2, 3))}, "'points' is of shape"),
-        ({"points": np.full((FRAMES, 2, 3), np.nan)}, "'points' must hold finite"),
+        ({"points": np.full((FRAMES, 2, 3), np.nan)}, "'points' holds values that are no finite"),
         ({"hand": np.array([0, 2])}, "'hand' has"),
         ({"hand": np.array([0.0, 1.0])}, "'hand' is"),
         ({"hand": np.array([0])}, "'hand' is"),

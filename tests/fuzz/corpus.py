@@ -40,12 +40,13 @@ from gausim.core.errors import GausSimError
 from gausim.data.corpus import Corpus
 from gausim.data.images import read_rgba, write_rgba
 from gausim.data.objects import ObjectData
-from gausim.data.records import read_array, read_stills
+from gausim.data.records import read_stills
 from gausim.data.verify import verify
 from gausim.interaction.selections import Ball, Kernels
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
 from gausim.io.motion import load_motion, motion_glb
+from gausim.io.npz import read_array
 from gausim.io.ply import load_masks, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory

@@ -14,9 +14,10 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from gausim.core import ConfigError, DataError, GaussianScene
-from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
+from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_stills
 from gausim.data.reserved import reserved_part
 from gausim.data.surroundings import gripped, read_surroundings
+from gausim.io.npz import read_array
 from gausim.io.plain_json import checked
 from gausim.io.ply import MASK_NAMES, load_scene
 from gausim.io.transforms import read_json

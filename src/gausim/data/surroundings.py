@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 from scipy.spatial import cKDTree
 
 from gausim.core import DataError, Floor, GaussianScene, HandPath, Surroundings
-from gausim.io.npz import read_npz
+from gausim.io.npz import read_array
 from gausim.io.plain_json import checked
 
 HANDS = "hands.npz"
@@ -62,19 +62,12 @@ def read_hands(folder: Path, frames: int) -> tuple[HandPath, torch.Tensor, torch
     path = folder / HANDS
     if not path.is_file():
         return None
-    try:
-        arrays = read_npz(path, ("points", "hand"))
-    except ValueError as error:
-        raise DataError(f"{path}: cannot be read as npz ({error}).") from error
-    for name in ("points", "hand"):
-        if name not in arrays:
-            raise DataError(f"{path}: array '{name}' is missing.")
-    points, hand = torch.from_numpy(arrays["points"]), torch.from_numpy(arrays["hand"])
+    points, hand = (torch.from_numpy(read_array(path, name)) for name in ("points", "hand"))
     if points.ndim != 3 or points.shape[0] != frames or points.shape[2] != 3 or not points.shape[1]:
         raise DataError(f"{path}: array 'points' is of shape {tuple(points.shape)}, expected ({frames}, C, 3).")
-    if not points.is_floating_point() or not bool(torch.isfinite(points).all()):
-        raise DataError(f"{path}: array 'points' must hold finite numbers, got {points.dtype}.")
-    if hand.shape != points.shape[1:2] or hand.is_floating_point() or hand.is_complex():
+    if not points.is_floating_point():
+        raise DataError(f"{path}: array 'points' must hold floating-point numbers, got {points.dtype}.")
+    if hand.shape != points.shape[1:2] or hand.is_floating_point():
         raise DataError(
             f"{path}: array 'hand' is {hand.dtype} {tuple(hand.shape)}, expected whole numbers ({points.shape[1]},)."
         )

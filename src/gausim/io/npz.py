@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from gausim.core.errors import DataError
+
 _SUFFIX, _MAGIC = ".npy", b"\x93NUMPY"
 # Highest compression ratio of deflate; a member that claims more is damaged.
 _MOST_PACKED = 1100
@@ -33,6 +35,27 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
             return {name: _array(archive, members[name], name) for name in chosen}
     except (OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(str(error) or type(error).__name__) from error
+
+
+def read_array(path: Path, field: str) -> np.ndarray:
+    """One array of an npz file, of numbers that are finite in float32.
+
+    Raises:
+        DataError: the file is missing or damaged, has no such array, or one of anything else; names file and field.
+    """
+    try:
+        arrays = read_npz(path, [field])
+    except ValueError as error:
+        raise DataError(f"{path}: cannot be read as npz ({error}).") from error
+    if field not in arrays:
+        raise DataError(f"{path}: array '{field}' is missing.")
+    values = arrays[field]
+    if values.dtype.kind not in "biuf":
+        raise DataError(f"{path}: array '{field}' holds {values.dtype}, expected numbers.")
+    with np.errstate(over="ignore"):
+        if values.dtype.kind == "f" and not np.isfinite(values.astype(np.float32, copy=False)).all():
+            raise DataError(f"{path}: array '{field}' holds values that are no finite numbers in float32.")
+    return values
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.ndarray:
