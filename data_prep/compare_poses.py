@@ -16,6 +16,7 @@ from data_prep.common.command import run_command, stage_parser
 from data_prep.common.photos import list_images
 from gausim.core.errors import DataError
 from gausim.io.colmap import find_colmap, read_colmap
+from gausim.io.plain_json import read_json
 
 
 def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
@@ -41,7 +42,7 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
 
 
 def _of_transforms(path: Path) -> dict[str, np.ndarray]:
-    from gausim.io.transforms import read_entries, read_json, viewmat_of
+    from gausim.io.transforms import read_entries, viewmat_of
 
     poses = {}
     for where, entry in read_entries(read_json(path), path):

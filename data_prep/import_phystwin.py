@@ -20,12 +20,13 @@ import numpy as np
 from msgspec import Meta
 
 from data_prep.common.command import option
-from data_prep.public.fields import REMEDY, field, lens, numbers, read_any_json, viewmat
+from data_prep.public.fields import REMEDY, field, lens, numbers, viewmat
 from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pickles import read_pickle
 from data_prep.public.pictures import masked, size_of
 from data_prep.public.scene import GRAVITY, Hands, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
+from gausim.io.plain_json import read_any_json
 
 META, POSES, FINAL, TRACKS, SPLIT = "metadata.json", "calibrate.pkl", "final_data.pkl", "gt_track_3d.pkl", "split.json"
 HUMAN = "different_types_human_mask"

@@ -30,7 +30,6 @@ from data_prep.public.fields import (
     numbered,
     numbers,
     rate_of,
-    read_any_json,
     read_list,
     viewmat,
 )
@@ -40,6 +39,7 @@ from data_prep.public.registration import register
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import ColmapModel, colmap_files, read_colmap
+from gausim.io.plain_json import read_any_json
 
 CAMERAS, CALIBRATION = "camera.json", "dynamic/cameras_calib.json"
 # Their renderer's world: frames every 0.03 s, a floor at this height, the first 20 of 30 frames seen.

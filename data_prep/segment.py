@@ -29,6 +29,7 @@ from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import MANIFEST, Stage, copy_missing, read_manifest, run_stage
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
+from gausim.io.plain_json import read_json
 
 # Raise when the same pictures and settings give other masks than before.
 REVISION = 1
@@ -204,8 +205,6 @@ def _beside(source: Path) -> dict[str, Path]:
 
 def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) -> None:
     """Copies what belongs to the pictures; ``transforms.json`` gets their new names."""
-    from gausim.io.transforms import read_json
-
     done = {path.resolve() for path in pictures.values()}
     for name, path in files.items():
         if path.suffix != ".json":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gausim.core.errors import DataError
-from gausim.io.plain_json import checked, parse_json
+from gausim.io.plain_json import checked, read_any_json
 
 # Larger numbers indicate damage: they would overflow float32 in later computations.
 _LARGEST = 1e9
@@ -22,20 +22,6 @@ _UNEVEN = 0.01
 _NESTED: dict[int, Any] = {1: list[float], 2: list[list[float]], 3: list[list[list[float]]]}
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 REMEDY = "Take the file that the set's authors publish."
-
-
-def read_any_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        DataError: it is missing or no JSON.
-    """
-    if not path.is_file():
-        raise DataError(f"{path}: no such file. Is this the folder that the set's layout names?")
-    try:
-        return parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error}). {REMEDY}") from error
 
 
 def read_list(path: Path, what: str) -> list[Any]:

@@ -14,8 +14,7 @@ from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import list_images, natural, open_photo
 from gausim.core.errors import DataError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
-from gausim.io.plain_json import checked, parse_json
-from gausim.io.transforms import read_json
+from gausim.io.plain_json import checked, read_any_json, read_json
 
 _VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")
 # Lists of meta.json; sequences of the last two are not used.
@@ -197,10 +196,7 @@ def read_pins(path: Path, count: int) -> np.ndarray:
     Raises:
         DataError: it is anything else, or a number is no kernel's.
     """
-    try:
-        data = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error}).") from error
+    data = read_any_json(path)
     if isinstance(data, dict):
         lists = [value for value in data.values() if isinstance(value, list)]
         data = lists[0] if len(lists) == 1 else None

@@ -10,7 +10,8 @@ from typing import Any
 from data_prep.common.photos import natural
 from gausim.core.errors import DataError
 from gausim.io.pixels import read_header
-from gausim.io.transforms import PosedImages, read_json, read_transforms
+from gausim.io.plain_json import read_json
+from gausim.io.transforms import PosedImages, read_transforms
 
 TRANSFORMS, FACTS, POINTS = "transforms.json", "dataset.json", "points.npz"
 

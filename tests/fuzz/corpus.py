@@ -47,10 +47,11 @@ from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin
 from gausim.io.colmap import read_colmap
 from gausim.io.motion import load_motion, motion_glb
 from gausim.io.npz import read_array
+from gausim.io.plain_json import read_json
 from gausim.io.ply import load_masks, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
-from gausim.io.transforms import read_json, read_transforms, write_transforms
+from gausim.io.transforms import read_transforms, write_transforms
 from gausim.io.video import read_video, video_rate, write_video
 from gausim.results.summary import SCHEMA, load_summary
 from gausim.runs.directory import RunDirectory

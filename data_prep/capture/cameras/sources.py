@@ -14,6 +14,7 @@ import scipy.linalg
 from data_prep.common.photos import Photo, list_images, open_photo
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import ColmapCamera, ColmapModel
+from gausim.io.plain_json import read_json
 
 # Endings with which projection matrices are named after their image.
 _MATRIX_ENDING = re.compile(r"([._-](P|proj|projection|camera))?$", re.IGNORECASE)
@@ -85,7 +86,7 @@ def read_lens_transforms(path: Path) -> list[Posed]:
             the lens is of a model that cannot be straightened.
     """
     from gausim.core import Cameras
-    from gausim.io.transforms import image_name, pinhole_of, read_entries, read_json, size_field, viewmat_of
+    from gausim.io.transforms import image_name, pinhole_of, read_entries, size_field, viewmat_of
 
     data = read_json(path)
     posed, names = [], set()

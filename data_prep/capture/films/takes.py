@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 
 from data_prep.common.photos import natural
 from gausim.core import DataError
-from gausim.io.plain_json import checked
+from gausim.io.plain_json import checked, read_json
 
 _Seconds = Annotated[float, Meta(ge=0, le=1e6)]
 
@@ -126,8 +126,6 @@ def _by_stem(folder: Path) -> dict[str, Path]:
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, Path], dict[str, Any]]]:
-    from gausim.io.transforms import read_json  # loads torch
-
     found = []
     for i, entry in enumerate(checked(read_json(path), _List, str(path), "See --help for the form.").sequences):
         offsets = {name: str(value) for name, value in entry.offsets.items()}

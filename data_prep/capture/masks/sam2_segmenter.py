@@ -18,7 +18,7 @@ from msgspec import Struct
 from data_prep.capture.masks.clips import Clip
 from data_prep.capture.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
-from gausim.io.plain_json import checked
+from gausim.io.plain_json import checked, read_json
 
 # The predictor reads JPEG files only; at this quality they differ from the frames by less than a camera's noise.
 JPEG_QUALITY = 98
@@ -124,8 +124,6 @@ def read_prompts(path: Path) -> dict[str, Prompt]:
     Raises:
         DataError: the file is missing or malformed.
     """
-    from gausim.io.transforms import read_json  # loads torch
-
     return {name: make_prompt(entry, f"{path}: '{name}'") for name, entry in read_json(path).items()}
 
 

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from gausim.core import DataError
-from gausim.io.plain_json import checked, parse_json
+from gausim.io.plain_json import checked, read_json
 
 MANIFEST = "manifest.json"
 SCHEMA = "gausim.corpus/1"
@@ -99,11 +99,8 @@ class Corpus:
         file = self.path / MANIFEST
         if not file.is_file():
             raise DataError(f"{file}: not found. Make a corpus with `gausim prepare corpus --out {self.path}`.")
-        try:
-            data = parse_json(file.read_bytes())
-        except ValueError as error:
-            raise DataError(f"{file}: not JSON ({error}). {REMEDY}") from error
-        found = data.get("schema") if isinstance(data, dict) else None
+        data = read_json(file)
+        found = data.get("schema")
         if found != SCHEMA:
             raise DataError(f"{file}: field 'schema' is {found!r}, expected {SCHEMA!r}. {REMEDY}")
         self.manifest: Manifest = checked(data, Manifest, str(file), REMEDY)

@@ -18,9 +18,8 @@ from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_stills
 from gausim.data.reserved import reserved_part
 from gausim.data.surroundings import gripped, read_surroundings
 from gausim.io.npz import read_array
-from gausim.io.plain_json import checked
+from gausim.io.plain_json import checked, read_json
 from gausim.io.ply import MASK_NAMES, load_scene
-from gausim.io.transforms import read_json
 from gausim.ops.selection import Selection, apply_masks, parse_half_space, require_pinned
 
 

@@ -13,7 +13,7 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
 from gausim.io.files import sha256
 from gausim.io.packed import PIXELS, is_packed, read_packed
-from gausim.io.transforms import read_json
+from gausim.io.plain_json import read_json
 
 # Manifest of the data preparation stages; a packed store contains only the files that it lists.
 MANIFEST = "stage.json"

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError
 from gausim.io.files import replacing, write_durably
-from gausim.io.plain_json import checked
-from gausim.io.transforms import read_json
+from gausim.io.plain_json import checked, read_json
 
 HEADER, PIXELS = "frames.json", "frames.bin"
 # Larger sizes indicate a damaged file.

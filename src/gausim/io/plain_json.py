@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -25,6 +26,28 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("brackets are nested too deep") from None
     except OverflowError:
         raise ValueError("an integer has more than 64 bits") from None
+    return data
+
+
+def read_any_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        DataError: it is missing or not JSON.
+    """
+    try:
+        return parse_json(path.read_bytes())
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file. Is this the right folder?") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error}). Restore it.") from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file, or a :class:`DataError` that names the file."""
+    data = read_any_json(path)
+    if not isinstance(data, dict):
+        raise DataError(f"{path}: expected a JSON object, got a {type(data).__name__}.")
     return data
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from gausim.core import DataError, GaussianScene, SceneError
 from gausim.io.files import write_json
+from gausim.io.plain_json import read_json
 from gausim.io.ply import load_scene, save_masks, save_scene
-from gausim.io.transforms import positive_field, read_json
+from gausim.io.transforms import positive_field
 
 # SuperSplat orders files by the number at the end of their names.
 _NAME = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,6})\.ply")

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError
 from gausim.io.pixels import read_header
-from gausim.io.plain_json import parse_json
+from gausim.io.plain_json import read_json
 
 # Camera models without distortion, or with distortion that is checked to be zero.
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
@@ -98,19 +98,6 @@ def write_transforms(path: Path, cameras: Cameras, entries: list[dict[str, Any]]
 
 def _lens_fields(k: Float[Tensor, "3 3"]) -> dict[str, float]:
     return {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2])}
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON object, or raises :class:`DataError` that names the file."""
-    try:
-        data = parse_json(path.read_bytes())
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file. Check the data set's root.") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as JSON ({error}).") from error
-    if not isinstance(data, dict):
-        raise DataError(f"{path}: expected a JSON object, got a {type(data).__name__}.")
-    return data
 
 
 def read_entries(data: dict[str, Any], path: Path) -> list[tuple[str, dict[str, Any]]]:
