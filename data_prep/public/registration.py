@@ -145,11 +145,10 @@ def _body(stills: Sequence[tuple[View, Picture]], tick: Tick) -> _Body:
 
     masks, ks, pictures = [], [], []
     for i, (view, picture) in enumerate(stills):
-        scale = min(1.0, CARVED / max(view.size))
-        size = max(1, round(view.size[0] * scale)), max(1, round(view.size[1] * scale))
-        pixels = resized(picture.read(), size)
+        small = view.smaller(CARVED)
+        pixels = resized(picture.read(), small.size)
         masks.append(pixels[..., 3] > HALF)
-        ks.append(np.diag([size[0] / view.size[0], size[1] / view.size[1], 1.0]) @ view.k)
+        ks.append(small.k)
         pictures.append(pixels)
         tick("hull", i + 1, len(stills))
     if len({mask.shape for mask in masks}) > 1:
@@ -211,14 +210,10 @@ def _window(view: View, picture: Picture) -> _Window:
     # Three times as wide as the mask: silhouettes that lie beside it count against the fit.
     corner, count = middle - 1.5 * side, 3 * CELLS
     grid = np.array([[1 / cell, 0, -corner[0] / cell], [0, 1 / cell, -corner[1] / cell]])
-    filled = cv2.warpAffine(_averaged(inside, cell), grid, (count, count), flags=cv2.INTER_LINEAR)
+    # Averaged over a cell, so that sampling it once per cell sees all of it.
+    averaged = cv2.blur(inside.astype(np.float32), (max(1, round(cell)),) * 2)
+    filled = cv2.warpAffine(averaged, grid, (count, count), flags=cv2.INTER_LINEAR)
     return _Window(view, corner, cell, _blurred(filled), middle, float(np.hypot(*(high - low))), pixels[..., :3])
-
-
-def _averaged(inside: np.ndarray, cell: float) -> np.ndarray:
-    """A mask averaged over a cell, so that sampling it once per cell sees all of it."""
-    width = max(1, round(cell))
-    return np.asarray(cv2.blur(inside.astype(np.float32), (width, width)))
 
 
 def _blurred(grid: np.ndarray) -> np.ndarray:

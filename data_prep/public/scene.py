@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,15 @@ class View:
     size: tuple[int, int]  # width and height of its pictures [pixels]
     k: np.ndarray  # (3, 3) intrinsics [pixels]; the centre of pixel 0 is at 0.5
     viewmat: np.ndarray  # (4, 4) world to camera, OpenCV axes
+
+    def smaller(self, longest: int | None) -> View:
+        """The same camera for pictures whose longer side is at most ``longest`` [pixels]; None leaves it alone."""
+        width, height = self.size
+        if longest is None or max(self.size) <= longest:
+            return self
+        scale = longest / max(self.size)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        return replace(self, size=size, k=np.diag([size[0] / width, size[1] / height, 1.0]) @ self.k)
 
 
 @dataclass(frozen=True, eq=False)

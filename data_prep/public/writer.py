@@ -53,7 +53,7 @@ class ObjectWriter:
         folder = self._work / "sequences" / motion.name
         done, entries, posed = 0, [], []
         for view in motion.views:
-            small = smaller(view, self._longest)
+            small = view.smaller(self._longest)
             for number, picture in enumerate(motion.pictures[view.name]):
                 name = f"{view.name}/{number:04d}.png"
                 self._picture(folder / name, picture, view, small)
@@ -74,9 +74,9 @@ class ObjectWriter:
             for view in shown:
                 source = self._work / "sequences" / first.name / view.name / "0000.png"
                 copy_missing(source, folder / "images" / f"{view.name}.png")
-            posed = [smaller(view, self._longest) for view in shown]
+            posed = [view.smaller(self._longest) for view in shown]
         else:
-            posed = [smaller(view, self._longest) for view, _ in shots]
+            posed = [view.smaller(self._longest) for view, _ in shots]
             for number, (small, (view, picture)) in enumerate(zip(posed, shots, strict=True), 1):
                 self._picture(folder / "images" / f"{view.name}.png", picture, view, small)
                 self._tick("stills", number, len(shots))
@@ -104,16 +104,6 @@ class ObjectWriter:
         for motion, positions in zip(self._found.motions, tracks, strict=True):
             path = self._work / "sequences" / motion.name / "ground_truth.npz"
             write_npz(path, displacement=(positions - rest).astype(np.float32))
-
-
-def smaller(view: View, longest: int | None) -> View:
-    """The same camera for pictures whose longer side is at most ``longest`` [pixels]."""
-    width, height = view.size
-    if longest is None or max(view.size) <= longest:
-        return view
-    scale = longest / max(view.size)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return View(view.name, size, np.diag([size[0] / width, size[1] / height, 1.0]) @ view.k, view.viewmat)
 
 
 def write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]], fps: float | None) -> None:
