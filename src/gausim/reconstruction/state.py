@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from gausim.interaction.session import digest
 from gausim.io.files import write_durably
 from gausim.reconstruction.reconstruction import ReconstructionOptions
 from gausim.reconstruction.splat_start import PointCloud
@@ -22,17 +22,12 @@ REVISION = 1
 
 
 def identity(sets: Sequence[ImageSet], options: ReconstructionOptions, cloud: PointCloud | None) -> str:
-    """SHA-256 of the inputs of a reconstruction: images, cameras, options and points."""
-    digest = hashlib.sha256(json.dumps([REVISION, asdict(options)], sort_keys=True).encode())
+    """Digest of the inputs of a reconstruction: images, cameras, options and points."""
     tensors = [x for s in sets for x in (s.images, s.cameras.viewmats, s.cameras.Ks)]
     if cloud is not None:
         tensors += [cloud.points] if cloud.colors is None else [cloud.points, cloud.colors]
-    for tensor in tensors:
-        digest.update(repr((tensor.dtype, tuple(tensor.shape))).encode())
-        digest.update(tensor.contiguous().numpy().tobytes())
-    for images in sets:
-        digest.update(repr((images.weight, images.span, images.cameras.width, images.cameras.height)).encode())
-    return digest.hexdigest()
+    sizes = [(s.weight, s.span, s.cameras.width, s.cameras.height) for s in sets]
+    return digest(json.dumps([REVISION, asdict(options), sizes], sort_keys=True), *tensors)
 
 
 class Partial:
