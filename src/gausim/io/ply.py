@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from gausim.core.errors import DataError, SceneError
@@ -49,7 +50,7 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     """
     path = Path(path)
     table = _read_vertices(path)
-    rest = _rest_names(path, tuple(table))
+    rest = _rest_names(path, table.dtype.names or ())
     values = torch.from_numpy(_columns(path, table, [*_POSITION, *_SHAPE, *_COLOR, *rest]))
     means, opacity, log_scales, quats, color, high = values.split((3, 1, 3, 4, 3, len(rest)), dim=1)
     sh = torch.cat([color[:, None], high.reshape(len(values), 3, -1).transpose(1, 2)], dim=1)
@@ -148,11 +149,11 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     return rest
 
 
-def _columns(path: Path, table: Mapping[str, np.ndarray], names: list[str]) -> np.ndarray:
+def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
     """These properties of all vertices, (K, n) float32, all finite."""
     # Doubles beyond float32 overflow to infinity, which the check below reports instead of a warning.
     with np.errstate(over="ignore"):
-        values = np.stack([table[name] for name in names], 1, dtype=np.float32, casting="same_kind")
+        values = structured_to_unstructured(table[names], np.float32)
     bad = ~np.isfinite(values)
     if bad.any():
         column = int(bad.any(0).argmax())
@@ -164,10 +165,10 @@ def _columns(path: Path, table: Mapping[str, np.ndarray], names: list[str]) -> n
     return values
 
 
-def _read_vertices(path: Path) -> dict[str, np.ndarray]:
-    """The properties of the vertices, which have to be the first element."""
+def _read_vertices(path: Path) -> np.ndarray:
+    """The table of the vertices, which have to be the first element."""
     try:
-        element, table = next(read_elements(path), (None, {}))
+        element, table = next(read_elements(path), (None, None))
     except DataError as error:
         raise SceneError(str(error)) from error
     if element is None or element.name != "vertex":
@@ -176,4 +177,4 @@ def _read_vertices(path: Path) -> dict[str, np.ndarray]:
     if element.count == 0 or element.lists:
         what = f"property '{element.lists[0]}' is a list" if element.lists else "is empty"
         raise SceneError(f"{path}: element 'vertex': {what}. Export the file as a 3DGS scene.")
-    return table
+    return np.asarray(table)

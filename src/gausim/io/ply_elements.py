@@ -46,10 +46,10 @@ class Element:
         return np.dtype(parts)
 
 
-def read_elements(path: Path) -> Iterator[tuple[Element, dict[str, Any]]]:
+def read_elements(path: Path) -> Iterator[tuple[Element, Any]]:
     """The elements of a file in their order, each with its columns by name; numbers of a text are float64.
 
-    A column is an array with one row per thing, or a list of arrays where lists differ in length.
+    The columns are fields of one structured array, or lists where the lists of an element differ in length.
 
     Raises:
         DataError: the file is missing, no PLY file, cut off, or longer than its header says.
@@ -71,7 +71,7 @@ def read_elements(path: Path) -> Iterator[tuple[Element, dict[str, Any]]]:
         yield element, columns
 
 
-def positions(path: Path, element: Element, columns: Mapping[str, Any]) -> np.ndarray:
+def positions(path: Path, element: Element, columns: Any) -> np.ndarray:
     """(N, 3) float64 of an element's fields x, y and z.
 
     Raises:
@@ -132,7 +132,7 @@ def _numbers(path: Path, text: bytes) -> bytes:
         raise DataError(f"{path}: expected numbers after the header ({error!s:.80}). Export it again.") from None
 
 
-def _take(path: Path, element: Element, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
+def _take(path: Path, element: Element, body: memoryview, at: int) -> tuple[Any, int]:
     """The columns of an element whose data begin at a byte, and where they end."""
     if not element.count:
         return {name: np.zeros(0) for name in element.fields}, at
@@ -141,7 +141,7 @@ def _take(path: Path, element: Element, body: memoryview, at: int) -> tuple[dict
     if end <= len(body):
         rows = np.frombuffer(body, layout, element.count, at)
         if all((rows[f"number of {name}"] == rows[name].shape[1]).all() for name in element.lists):
-            return {name: rows[name] for name in element.fields}, end
+            return rows, end
     if not element.lists:
         raise _truncated(path, element, len(body) - at)
     found: dict[str, list[Any]] = {name: [] for name in element.fields}
