@@ -87,6 +87,7 @@ def test_what_an_entry_says_itself_wins(tmp_path: Path) -> None:
         ({"fl_x": -3.0}, "focal lengths must be positive"),
         ({"fl_x": None, "camera_angle_x": 0}, "'camera_angle_x' must be between 0 and pi"),
         ({"h": None}, "field 'h' must be a finite number"),
+        ({"h": 0}, "fields 'w', 'h' must be positive"),
         ({"w": None, "h": None}, "has no 'w' and 'h'"),
         ({"k1": 0.02}, r"the lens is distorted \(\{'k1': 0.02\}\)"),
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported"),
