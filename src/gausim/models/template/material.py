@@ -51,10 +51,6 @@ from gausim.nn.mlp import mlp
 
 # Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
-# Initial stiffness and inertia of all linear links together, as fractions (of the trace) of the body's.
-LINK_FRACTION = 0.3
-# The same for the stiffness of the nonlinear links, whose linear part is in K and the rest in f and J.
-SPRING_FRACTION = 0.15
 # Lame's parameters at Young's modulus 1.
 FIRST, SECOND = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
 # Number of units among which a cell's energy is divided, by inverse squared distance.
@@ -66,6 +62,15 @@ AMPLITUDE = 0.05
 GAIN, DAMPING_GAIN = 10.0, 2.0
 # Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
+
+
+@dataclass(frozen=True)
+class Links:
+    """Links between neighbouring units."""
+
+    neighbours: int = 12  # of a unit
+    linear: float = 0.3  # initial stiffness and inertia of all linear links, as fractions (of the trace) of the body's
+    springs: float = 0.15  # the same for the stiffness of nonlinear links; its linear part is in K, the rest in f and J
 
 
 class BodyModes(nn.Module):
@@ -191,7 +196,7 @@ class MaterialTemplate(Template):
         frames: Sequence[np.ndarray],
         modes: int = 48,
         spacing: float = 0.12,
-        links: int = 12,
+        links: Links | int = Links(),
         hidden: int = 48,
         period: float = 8.0,
         damping: float = 0.02,
@@ -207,7 +212,7 @@ class MaterialTemplate(Template):
             frames: axes (3, 3) of each scene in which the template works.
             modes: number of modes.
             spacing: spacing of the solid body's grid [diagonals].
-            links: neighbours per unit.
+            links: links between units; a number stands for so many neighbours.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
@@ -224,8 +229,9 @@ class MaterialTemplate(Template):
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
         self.conserve_volume, self.named_attributes = conserve_volume, named_attributes
+        self.links = Links(links) if isinstance(links, int) else links
         self.bodies = nn.ModuleList(
-            BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
+            BodyModes(h, finest, f, modes=modes, spacing=spacing, links=self.links.neighbours)
             for h, f in zip(hierarchies, frames, strict=True)
         )
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
@@ -266,10 +272,10 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
-        springs = SPRING_FRACTION * links[:, 2].exp()
-        stretch = (LINK_FRACTION * links[:, 0].exp() + springs)[:, None] * body.stretch
+        springs = self.links.springs * links[:, 2].exp()
+        stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
-        density, between = _saturated(log_density).exp(), LINK_FRACTION * links[:, 1].exp()
+        density, between = _saturated(log_density).exp(), self.links.linear * links[:, 1].exp()
         heavy = density[:, None, None] * body.inertia
         root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
         inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
@@ -287,12 +293,12 @@ class MaterialTemplate(Template):
         body = self.body(scene_id)
         decoded, links = self.decode(body, units.attributes)
         parts = body.stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)  # of shear and volume (2, N)
-        factors = LINK_FRACTION * links[:, 0].exp() + SPRING_FRACTION * links[:, 2].exp()
+        factors = self.links.linear * links[:, 0].exp() + self.links.springs * links[:, 2].exp()
         size = 0.5 * body.stretch.square().sum(-1)
         own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
         for end in body.links:
             own = own.index_add(0, end, factors * size)
-            homogeneous = homogeneous.index_add(0, end, (LINK_FRACTION + SPRING_FRACTION) * size)
+            homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.links.springs) * size)
         drag = REFERENCE_FPS * (self.start[1] + DAMPING_GAIN * self.damping[0]).exp()
         return {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
