@@ -248,3 +248,28 @@ def test_matrices_tell_which_unit_resists_and_how_fast_an_impulse_is_damped(elas
     assert int(found.nan_to_num().argmax()) == unit
     elastic.inertia_mixing.copy_(0.05 * torch.randn(9, 9, generator=torch.Generator().manual_seed(0)))
     assert torch.isfinite(elastic.resistance()[moving]).all() and (elastic.damping_rate()[moving] > 0).all()
+
+
+def test_a_load_acts_on_masses_and_stiffness_of_its_own(elastic: ElasticScene) -> None:
+    """Of an acceleration Phi a within the modes the force is M a; of d times the mass beyond it (1 + d) M a."""
+    a = torch.randn(2, 9, generator=torch.Generator().manual_seed(5)).double()
+    accelerations = torch.einsum("ndm,sm->snd", elastic.modes, a)
+    load = torch.cat((accelerations, accelerations.new_zeros(2, len(elastic.modes), 9)), -1)
+    torch.testing.assert_close(PreparedElastic(elastic).force(load), a, atol=1e-5, rtol=1e-5)
+    elastic.beyond[:, 0] = 0.5
+    torch.testing.assert_close(PreparedElastic(elastic).force(load), 1.5 * a, atol=1e-5, rtol=1e-5)
+    strained = torch.cat((0.0 * accelerations, torch.eye(3).double().flatten().expand(2, len(elastic.modes), 9)), -1)
+    assert not PreparedElastic(elastic).force(strained).any()
+    elastic.beyond[:, 1:] = 0.2
+    bulk = (
+        0.2 * (2 / 2.6 + 3 * 0.3 / (1.3 * 0.4)) * (2 * math.pi / 12.0) ** 2
+    )  # of Young's modulus 1, Poisson's ratio 0.3
+    expected = -bulk * elastic.strains[:, ::4].sum((0, 1))
+    torch.testing.assert_close(PreparedElastic(elastic).force(strained)[0], expected, atol=1e-6, rtol=1e-4)
+
+
+def test_checkpoints_that_know_no_load_are_read(elastic: ElasticScene) -> None:
+    old = {name: value for name, value in elastic.state_dict().items() if name != "beyond"}
+    elastic.beyond.fill_(1.0)
+    elastic.load_state_dict(old)
+    assert not elastic.beyond.any()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import solid_body
 from gausim.models.template.springs import limited, unit_springs
-from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template
+from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template, force_of_strain
 
 # Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
 # modes.
@@ -42,6 +43,7 @@ class ElasticScene(nn.Module):
     modes: Tensor
     projection: Tensor
     gradients: Tensor
+    strains: Tensor
 
     def __init__(
         self,
@@ -58,12 +60,13 @@ class ElasticScene(nn.Module):
         finer = hierarchy.levels[0]
         kernels, spacing = finer.rest.double().numpy(), solid * hierarchy.diagonal
         body = solid_body(kernels, finer.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=spacing)
-        values, phi, slopes = body.of_units(rest, pinned)
+        values, phi, slopes, strains = body.of_units(rest, pinned)
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
         self.register_buffer("modes", torch.from_numpy(phi).float())
         self.register_buffer("projection", torch.from_numpy(phi * mass[:, None, None]).float())
         self.register_buffer("gradients", torch.from_numpy(slopes).float())
+        self.register_buffer("strains", torch.from_numpy(strains).float(), persistent=False)
         self.scale = amplitude * hierarchy.diagonal * math.sqrt(len(rest) / count)
         self.initial_log_stiffness = 2 * math.log(2 * math.pi / period)
         self.stiffness = nn.Parameter(torch.zeros(()))
@@ -72,8 +75,15 @@ class ElasticScene(nn.Module):
         self.damping = nn.Parameter(torch.zeros(count))
         self.damping_mixing = nn.Parameter(torch.zeros(count, count))
         self.inertia_mixing = nn.Parameter(torch.zeros(count, count))
+        # Of every unit: density, stiffness of shear and of volume [k], beyond those of a homogeneous body under a load.
+        self.beyond = nn.Parameter(torch.zeros(len(rest), 3))
         self.springs = unit_springs(rest, phi, neighbours)
         self.gain = nn.Parameter(torch.tensor(float(geometric)))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Also of checkpoints that know no load."""
+        state_dict.setdefault(f"{prefix}beyond", torch.zeros_like(self.beyond))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def roots(self) -> tuple[Tensor, Tensor]:
         """S (M,) and L (M, M) of K = S L L^T S."""
@@ -155,6 +165,14 @@ class PreparedElastic(ModalScene):
         """z_{t+1}; the springs' contribution is limited to a fraction of the stiffness's."""
         linear = torch.cat((z, previous), -1) @ self.transition
         return linear + limited(self.scene.springs(z) @ self.turned, z @ self.pull)
+
+    def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
+        """Phi^T M a of an acceleration a within the modes, and what density and stiffness add that are not even."""
+        acceleration, strain = load.split((3, 9), -1)
+        density, uneven = self.scene.beyond.split((1, 2), -1)
+        scale = (self.scene.initial_log_stiffness + SPECTRUM_GAIN * self.scene.stiffness).exp()
+        own = super().force(load) + (density * acceleration).flatten(1) @ self.projection
+        return own + force_of_strain(strain, scale * uneven, self.scene.strains)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """|H v|^2 / 2 + (H m)^T K H m / 2 + the springs' nonlinear part; conserved without damping and springs."""

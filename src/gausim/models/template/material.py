@@ -34,27 +34,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.solid import POISSON, SolidBody, solid_body
+from gausim.models.template.solid import FIRST, SECOND, SolidBody, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
-from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template
+from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template, force_of_strain
 from gausim.nn.mlp import mlp
 
 # Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
-# Lame's parameters at Young's modulus 1.
-FIRST, SECOND = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
-# Number of units among which a cell's energy is divided, by inverse squared distance.
-CELL_UNITS = 4
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
@@ -108,7 +102,6 @@ class BodyModes(nn.Module):
         length = np.linalg.norm(offset, axis=1)
         stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
         even = math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
-        stiffness, strain = _cell_stiffness(body, rest, pinned)
         # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
         self.tie = math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
         arrays = {
@@ -116,8 +109,8 @@ class BodyModes(nn.Module):
             "gradients": slope,
             "projection": phi * mass[:, None, None],
             "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
-            "stiffness": stiffness / lowest,
-            "strain": strain / lowest,
+            "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
+            "strain": body.strains(rest),
             "inertia": phi * np.sqrt(mass)[:, None, None],
             "stretch": even * stretch,
             "between": self.tie * change,
@@ -137,34 +130,24 @@ def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
     return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
 
 
-def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included.
-
-    And the strain of the modes in these cells times their volume (N, 9, M).
-    """
+def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
+    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included."""
     _, slope = body.at(body.centres)
     strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
     trace = np.trace(strain, axis1=1, axis2=2)
     count = slope.shape[-1]
     # Components per cell and mode whose squares sum to twice the energy: nine of shear, one of volume.
     parts = math.sqrt(2 * SECOND) * strain.reshape(-1, 9, count), math.sqrt(FIRST) * trace[:, None]
-    near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
-    near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
-    weights = 1 / (near**2 + 1e-12)
-    weights /= weights.sum(1, keepdims=True)
     found = np.zeros((2, len(rest), count, count))
-    for unit in range(len(rest)):
-        cells, place = np.nonzero(units == unit)
-        size = np.sqrt(weights[cells, place] * body.weights[cells])[:, None, None]
+    for unit, share in enumerate(body.shares(rest)):
+        size = np.sqrt(share.data)[:, None, None]
         for total, roots in zip(found, parts, strict=True):
-            part = (roots[cells] * size).reshape(-1, count)
+            part = (roots[share.indices] * size).reshape(-1, count)
             total[unit] = part.T @ part
     missing = np.diag(body.values) - found.sum((0, 1))  # the springs that hold the pins, and rounding
     free = ~pinned
     found[0, free] += missing / free.sum()
-    shares = sp.csr_matrix((weights.ravel(), (units.ravel(), np.arange(units.size) // units.shape[1])))
-    strained = shares @ (body.weights[:, None] * strain.reshape(len(strain), -1))
-    return found, strained.reshape(len(rest), 9, -1)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,12 +350,8 @@ class PreparedMaterial(ModalScene):
         first, second = (acceleration.index_select(1, end) for end in self.body.links)
         tied = self.body.tie * self.matrices.between[:, None] * (second - first)
         own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
-        shear, volume = self.matrices.uneven.unbind(-1)
-        trace = strain[..., ::4].sum(-1) * (FIRST * volume)
-        stress = 2 * SECOND * shear[:, None] * strain + trace[..., None] * torch.eye(3).to(strain).flatten()
-        return (
-            own + tied.flatten(1) @ self.body.between.flatten(0, 1) - stress.flatten(1) @ self.body.strain.flatten(0, 1)
-        )
+        own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
+        return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
     def correction_unit(self) -> Float[Tensor, ""] | None:
         """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.

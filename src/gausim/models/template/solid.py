@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from scipy import ndimage
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh, factorized
+from scipy.spatial import cKDTree
 
 # Stiffness of the cells around the body, as a fraction of that of cells inside.
 OUTSIDE = 0.01
@@ -22,6 +23,10 @@ OUTSIDE = 0.01
 SUBDIVISIONS = 2
 # Poisson's ratio. Rubber and plant tissue are nearly incompressible; 0.3 avoids locking of quadratic splines.
 POISSON = 0.3
+# Lame's parameters at Young's modulus 1.
+FIRST, SECOND = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
+# Number of units among which a cell is divided, by inverse squared distance.
+CELL_UNITS = 4
 # Stiffness of the springs that hold pinned kernels, relative to a grid cell.
 PIN_STIFFNESS = 1e3
 # Nodes at the rim with a stiffness below this fraction of the largest are left out: they are subject to rounding.
@@ -120,14 +125,12 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
     nodes, _, gradients = grid.splines(centres)
     slopes = [matrix(nodes, gradients[..., a], grid.size) for a in range(3)]
     weight = sp.diags(weights)
-    first = POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
-    second = 1 / (2 * (1 + POISSON))
-    laplace = second * sum(s.T @ weight @ s for s in slopes)
+    laplace = SECOND * sum(s.T @ weight @ s for s in slopes)
     nothing = sp.csr_matrix(laplace.shape)
     return [
         [
-            first * slopes[a].T @ weight @ slopes[b]
-            + second * slopes[b].T @ weight @ slopes[a]
+            FIRST * slopes[a].T @ weight @ slopes[b]
+            + SECOND * slopes[b].T @ weight @ slopes[a]
             + (laplace if a == b else nothing)
             for b in range(3)
         ]
@@ -152,19 +155,34 @@ class SolidBody:
         modes = np.einsum("nk,ankm->nam", values, at, optimize=True)
         return modes, np.einsum("nkb,ankm->nabm", gradients, at, optimize=True)
 
-    def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def shares(self, rest: np.ndarray) -> sp.csr_matrix:
+        """Volume (N, Q) of every cell that belongs to each of the units at ``rest`` (N, 3) [scene units^3]."""
+        near, units = cKDTree(rest).query(self.centres, k=min(CELL_UNITS, len(rest)))
+        near, units = near.reshape(len(self.centres), -1), units.reshape(len(self.centres), -1)
+        parts = 1 / (near**2 + 1e-12)
+        parts *= self.weights[:, None] / parts.sum(1, keepdims=True)
+        cells = np.repeat(np.arange(len(units)), units.shape[1])
+        return sp.csr_matrix((parts.ravel(), (units.ravel(), cells)), shape=(len(rest), len(units)))
+
+    def strains(self, rest: np.ndarray) -> np.ndarray:
+        """Strain of the modes in the cells near each unit, row by row, times their volume (N, 9, M), over lambda_1."""
+        _, slope = self.at(self.centres)
+        strain = (slope + slope.transpose(0, 2, 1, 3)).reshape(len(slope), -1) / 2
+        return (self.shares(rest) @ strain).reshape(len(rest), 9, -1) / self.values[0]
+
+    def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
 
         Returns:
-            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, and
-            displacement gradients (N, 3, 3, M) [1 / scene units].
+            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, their
+            displacement gradients (N, 3, 3, M) [1 / scene units], and :meth:`strains`.
         """
         phi, slope = self.at(rest)
         phi[pinned], slope[pinned] = 0, 0
         flat = phi.reshape(-1, phi.shape[-1])
         scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
         values = np.maximum(self.values, 1e-4 * self.values[-1])
-        return values / values[0], phi * scale, slope * scale
+        return values / values[0], phi * scale, slope * scale, self.strains(rest) * scale
 
 
 def solid_body(

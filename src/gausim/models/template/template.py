@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch, rows_by_scene
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.template.solid import FIRST, SECOND
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
@@ -187,6 +188,22 @@ class ModalScene(ABC):
     @abstractmethod
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """Energy of v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2; only the state receives loss gradients."""
+
+
+def force_of_strain(
+    strain: Float[Tensor, "S N 9"], uneven: Float[Tensor, "N 2"], modes: Float[Tensor, "N 9 M"]
+) -> Float[Tensor, "S M"]:
+    """-sum_n (2 mu u_n0 S_n + lambda u_n1 tr S_n) : E_n, the modal force of a strain S of the reference.
+
+    Args:
+        strain: S of every unit, row by row.
+        uneven: stiffness of shear and of volume beyond that of the homogeneous body [1 / frame^2].
+        modes: E, strain of the modes near each unit times volume, as ``SolidBody.strains`` gives it.
+    """
+    shear, volume = uneven.unbind(-1)
+    trace = strain[..., ::4].sum(-1) * (FIRST * volume)
+    stress = 2 * SECOND * shear[:, None] * strain + trace[..., None] * torch.eye(3).to(strain).flatten()
+    return -stress.flatten(1) @ modes.flatten(0, 1)
 
 
 class PreparedScenes(PreparedTemplate):
