@@ -176,7 +176,8 @@ def test_jobs_of_a_table_compose(path: Path) -> None:
         assert known is None or known == yaml.safe_load(values[-1]), key
 
 
-def test_a_comparison_is_at_strength_on_sealed_data() -> None:
+def test_a_comparison_is_at_strength_on_sealed_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GAUSIM_SYNTHETIC_TEST", raising=False)
     config = compose("train", ["experiment=tables/comparison", "method=physdreamer", "protocol=bunny_test"])
     assert config.model.method.discretisation.filling.dense == 1.0 and config.model.method.discretisation.cells == 32
     assert config.data.sequences == config.data.test.sequences == ["seq_008", "seq_009", "seq_010", "seq_011"]
