@@ -100,3 +100,10 @@ def test_the_settings_of_material_points_are_in_groups() -> None:
     assert with_present_names({**new, "gradients": True}) == new
     with pytest.raises(ValueError, match="gradients is False, which is no longer supported"):
         with_present_names({**new, "gradients": False})
+
+
+def test_settings_of_a_filling_that_are_gone_are_dropped_unless_they_were_used() -> None:
+    filling = {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0, "ray_axis": 0, "open_side": None, "seed": 0}
+    assert with_present_names(filling) == {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0}
+    with pytest.raises(ValueError, match="ray_axis is 2, which is no longer supported"):
+        with_present_names({**filling, "ray_axis": 2})
