@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -61,7 +62,12 @@ def filmed(model: GausSim, coordinates: Tensor) -> SequenceSample:
         deformation_gradients,
         polar_rotation(deformation_gradients),
     )
-    drawn = draw(CpuRenderer(), SCENE, *state, motions.unit_of_kernel, toy_object.cameras())
+    return _film(state, motions.unit_of_kernel)
+
+
+def _film(state: Sequence[Tensor], unit_of_kernel: Tensor) -> SequenceSample:
+    """A sample whose frames show the kernels, deformation gradients and rotations of a state."""
+    drawn = draw(CpuRenderer(), SCENE, *state, unit_of_kernel, toy_object.cameras())
     straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
     rgba = (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
     return replace(sway.sample(0, FRAMES - 1), frames=rgba)
@@ -98,10 +104,7 @@ def test_motion_about_moving_hands_is_found_in_the_images(sources: Sources, coor
     state = [torch.stack(x) for x in zip(*(row[:3] for row in placed), strict=True)]
     moved = (state[0][-1] - SCENE.means)[SCENE.pinned]
     torch.testing.assert_close(moved, way[-1].expand_as(moved))
-    drawn = draw(CpuRenderer(), SCENE, *state, motions.unit_of_kernel, toy_object.cameras())
-    straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
-    rgba = (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
-    filmed = replace(sway.sample(0, FRAMES - 1), frames=rgba)
+    filmed = _film(state, motions.unit_of_kernel)
     tracks = TrackSupervision(replace(sources, motions=model.smooth_motions, references=method.references))
     found, free = tracks.motion(filmed).positions, ~SCENE.pinned
     error = (found - state[0][:, free]).norm(dim=-1).mean(1)

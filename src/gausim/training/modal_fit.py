@@ -34,9 +34,7 @@ class KnownMotion:
     before: Float[Tensor, "B M"]
     now: Float[Tensor, "B M"]
     after: Float[Tensor, "T B M"]
-    load: Float[Tensor, "T B N 12"] | None = (
-        None  # of the units (:class:`gausim.models.reference.reference.UnitMotion`)
-    )
+    load: Float[Tensor, "T B N 12"] | None = None  # of the units, as in UnitMotion
 
     def distances(self, part: ModalScene) -> Iterator[Float[Tensor, " B"]]:
         """Squared distances of the rollouts of a template from the motion, in squared sizes, frame by frame."""

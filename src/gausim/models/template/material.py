@@ -132,10 +132,8 @@ def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
 
 def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
     """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included."""
-    _, slope = body.at(body.centres)
-    strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
-    trace = np.trace(strain, axis1=1, axis2=2)
-    count = slope.shape[-1]
+    strain = body.cell_strain
+    trace, count = np.trace(strain, axis1=1, axis2=2), strain.shape[-1]
     # Components per cell and mode whose squares sum to twice the energy: nine of shear, one of volume.
     parts = math.sqrt(2 * SECOND) * strain.reshape(-1, 9, count), math.sqrt(FIRST) * trace[:, None]
     found = np.zeros((2, len(rest), count, count))

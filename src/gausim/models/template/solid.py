@@ -9,6 +9,7 @@ mass is that of the units. The resulting modes are smooth across gaps between ke
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -155,6 +156,12 @@ class SolidBody:
         modes = np.einsum("nk,ankm->nam", values, at, optimize=True)
         return modes, np.einsum("nkb,ankm->nabm", gradients, at, optimize=True)
 
+    @cached_property
+    def cell_strain(self) -> np.ndarray:
+        """Strain of the modes in every cell (Q, 3, 3, M) [1 / scene units]."""
+        _, slope = self.at(self.centres)
+        return (slope + slope.transpose(0, 2, 1, 3)) / 2
+
     def shares(self, rest: np.ndarray) -> sp.csr_matrix:
         """Volume (N, Q) of every cell that belongs to each of the units at ``rest`` (N, 3) [scene units^3]."""
         near, units = cKDTree(rest).query(self.centres, k=min(CELL_UNITS, len(rest)))
@@ -166,9 +173,9 @@ class SolidBody:
 
     def strains(self, rest: np.ndarray) -> np.ndarray:
         """Strain of the modes in the cells near each unit, row by row, times their volume (N, 9, M), over lambda_1."""
-        _, slope = self.at(self.centres)
-        strain = (slope + slope.transpose(0, 2, 1, 3)).reshape(len(slope), -1) / 2
-        return (self.shares(rest) @ strain).reshape(len(rest), 9, -1) / self.values[0]
+        return (self.shares(rest) @ self.cell_strain.reshape(len(self.centres), -1)).reshape(
+            len(rest), 9, -1
+        ) / self.values[0]
 
     def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
