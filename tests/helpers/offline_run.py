@@ -1,4 +1,7 @@
-"""Reads what an offline run of Weights & Biases has written: LevelDB's log format, one protocol buffer per record."""
+"""Reads what an offline run of Weights & Biases has written: LevelDB's log format, one protocol buffer per record.
+
+Another process writes the file, so its end may be a part of a record: reading ends before it.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,8 @@ def records(path: Path) -> Iterator[Any]:
             continue
         _, length, kind = struct.unpack("<IHB", data[place : place + _HEAD])
         body = data[place + _HEAD : place + _HEAD + length]
+        if len(body) < length:
+            return
         place += _HEAD + length
         parts = parts + body if kind in (3, 4) else body  # 1 whole, 2 first, 3 middle, 4 last
         if kind in (1, 4):

@@ -174,9 +174,9 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
         torch.testing.assert_close(
             springs(z.detach()[None])[0], expected, rtol=1e-3, atol=1e-4 * float(expected.norm())
         )
-        potential = springs.potential(z[None])[0]
-        torch.testing.assert_close(potential, energy(z) / lowest, rtol=1e-3, atol=1e-5 * float(potential.abs()))
         z = z.detach()
+        potential, expected = springs.potential(z[None])[0], energy(z) / lowest
+        torch.testing.assert_close(potential, expected, rtol=1e-3, atol=1e-5 * float(expected.abs()))
     pulls = [float(springs(s * z[None]).norm()) for s in (1e-3, 2e-3)]
     assert pulls[1] / pulls[0] == pytest.approx(4, rel=0.02) and not bool(springs(0 * z[None]).any())
     # It takes part in the step with its trained gain.
