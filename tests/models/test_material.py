@@ -70,7 +70,7 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
         stiffness += units[i, 0].exp() * body.stiffness[0, i] + units[i, 1].exp() * body.stiffness[1, i]
         inertia += rho[i] * own
         drag += rho[i] * units[i, 2].exp() * own
-    for e in range(body.links.shape[1]):
+    for e in range(body.springs.ends.shape[1]):
         stretch = 0.3 * links[e, 0].exp() + 0.15 * links[e, 2].exp()
         stiffness += stretch * torch.outer(body.stretch[e], body.stretch[e])
         inertia += 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
@@ -141,9 +141,8 @@ def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous
     expected = -torch.einsum("q,qabm,ab->m", torch.from_numpy(body.weights), slope, stress) / body.values[0]
     matrices = template.matrices(0, *(0.0 * x for x in _material(hierarchy)), 1 / 24)
     assert not matrices.uneven.any()
-    part = PreparedMaterial(
-        template.body(0), replace(matrices, uneven=torch.tensor([0.7, 0.2]).double().expand(len(rest), 2)), None
-    )
+    uneven = torch.tensor([0.7, 0.2]).double().expand(len(rest), 2)
+    part = PreparedMaterial(template.body(0), replace(matrices, uneven=uneven, tense=0 * matrices.tense), None)
     load = torch.cat((torch.zeros(3), even.flatten())).double().expand(1, len(rest), 12)
     torch.testing.assert_close(part.force(load)[0], expected, atol=1e-5, rtol=1e-4)
 
@@ -163,7 +162,37 @@ def test_the_step_is_implicit_in_the_slope_of_the_force(neural) -> None:
     torch.testing.assert_close(springs.linearised(z, only)[1][0], slope.detach())
     force = springs(z, matrices.links) - z @ matrices.stiffness - (z - previous) @ matrices.damping
     operator = matrices.inertia + (matrices.stiffness + found) / 4 + matrices.damping / 2
-    torch.testing.assert_close(part.change(z, previous)[0], torch.linalg.solve(operator, force[0]))
+    made = 2 * z - previous + torch.linalg.solve(operator, force[0])
+    torch.testing.assert_close(part.after(z, previous), made)
+
+
+def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
+    """With D the displacement gradient of the reference at the units, a spring is d_0 + D d_0 + Psi z."""
+    model = neural()
+    springs, count = model.template.body(0).springs, model.hierarchies[0].levels[1].count
+    draw = partial(torch.randn, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    slope, z, factor = 0.1 * draw(1, count, 9), (0.05 * draw(9)).requires_grad_(), 1 + 0.1 * draw(springs.ends.shape[1])
+    mean = slope[0, springs.ends].mean(0).view(-1, 3, 3)
+
+    def energy(z):
+        changes = (mean @ springs.offset[..., None])[..., 0] + (springs.modes @ z).view(-1, 3)
+        length = springs.offset.norm(dim=-1)
+        along = (springs.offset / length[:, None] * changes).sum(-1)
+        both = ((springs.offset + changes).norm(dim=-1) - length).square(), along.square()
+        return torch.stack([0.5 * (factor * springs.stiffness * x).sum() for x in both])
+
+    whole, linear = (torch.autograd.grad(energy(z)[i], z)[0] for i in range(2))
+    torch.testing.assert_close(springs(z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5)
+    nothing = torch.zeros_like(z)
+    (pulled,) = torch.autograd.grad(energy(nothing.requires_grad_())[1], nothing)
+    torch.testing.assert_close(springs.pull(slope, factor)[0], -pulled, atol=1e-7, rtol=1e-5)
+    turn = quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    turned = (turn - torch.eye(3)).flatten().expand(1, count, 9)
+    both = springs(nothing.detach()[None], factor, turned) + springs.pull(turned, factor)
+    assert float(both.norm()) < 1e-5 * float(springs.pull(turned, factor).norm())  # a rotation strains nothing
+    stretched = 0.1 * torch.eye(3, dtype=torch.float64).flatten().expand(1, count, 9)
+    stiffer = springs.linearised(nothing.detach()[None], factor, stretched)[1][0]
+    assert torch.linalg.eigvalsh(stiffer)[0] > 0  # what is taut resists more in every direction
 
 
 @torch.no_grad()
@@ -176,7 +205,7 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neur
         model.template.damping.fill_(damping / DAMPING_GAIN)
         prepared = model.prepare(batch)
         ((part, _, _),) = prepared.template.parts  # without links beyond the linear: only K is kept exactly
-        part.matrices = replace(part.matrices, links=torch.zeros_like(part.matrices.links))
+        part.factor = torch.zeros_like(part.factor)
         state = SimState(scene.means, scene.means - start)
         first = float(model.energy(batch, state, prepared))
         for _ in range(60):
@@ -268,14 +297,14 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural
     prepared = model.prepare(batch)
     ((part, _, _),) = prepared.template.parts
     moved = model.smooth_motions(0).kernels @ torch.linspace(1, 0.5, 9, dtype=torch.float64)
-    sizes, implicit = {}, part.change
+    sizes, implicit = {}, part.after
 
-    def explicit(z, previous):
-        at_start = part.springs(z, part.matrices.links), torch.zeros_like(part.operator)
+    def explicit(z, previous, load):
+        at_start = part.springs(z, part.factor), torch.zeros_like(part.stiffness)
         with mock.patch.object(part.springs, "linearised", return_value=at_start):
-            return implicit(z, previous)
+            return implicit(z, previous, load)
 
-    for name, part.change in (("implicit", implicit), ("explicit", explicit)):
+    for name, part.after in (("implicit", implicit), ("explicit", explicit)):
         state = SimState(scene.means + moved, scene.means + moved)
         for _ in range(80):
             step = model.step(batch, state, prepared=prepared)
@@ -287,7 +316,7 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural
 def test_the_material_of_the_units_is_told_as_it_enters_the_matrices(hierarchy) -> None:
     template, count = _template(hierarchy), hierarchy.levels[1].count
     units, links = torch.zeros(count, 3, dtype=torch.float64), template.body(0).distance.new_zeros(1, 3)
-    links = links.expand(template.body(0).links.shape[1], 3)
+    links = links.expand(template.body(0).springs.ends.shape[1], 3)
     zeros = torch.zeros(count, 3, dtype=torch.float64)
     fixed = FixedUnits(zeros, zeros[:, 0], zeros[:, 0], zeros[:, 0] + 9, zeros, zeros[:, :1])
 

@@ -38,11 +38,9 @@ class KnownMotion:
 
     def distances(self, part: ModalScene) -> Iterator[Float[Tensor, " B"]]:
         """Squared distances of the rollouts of a template from the motion, in squared sizes, frame by frame."""
-        before, now, pushed = self.before, self.now, torch.zeros_like(self.after)
-        if self.load is not None:
-            pushed = part.response(self.load.flatten(0, 1)).view_as(self.after)
-        for true, push in zip(self.after, pushed, strict=True):
-            before, now = now, part.after(now, before) + push
+        before, now = self.before, self.now
+        for frame, true in enumerate(self.after):
+            before, now = now, part.after(now, before, None if self.load is None else self.load[frame])
             yield (now - true).square().sum(-1) / self.size.square()
 
     def error(self, part: ModalScene) -> Float[Tensor, ""]:

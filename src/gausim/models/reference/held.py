@@ -1,10 +1,13 @@
 """A body in hands, or in pins above a floor: its reference is the static shape that its pins prescribe.
 
-The pins' best rigid motion B_0 carries the whole body. Relative to it every hand is displaced by d_g and turned by
+The pins' best rigid motion B carries the whole body. Relative to it every hand is displaced by d_g and turned by
 theta_g, and a homogeneous elastic body follows by the static modes Psi of component mode synthesis (Craig and Bampton
 1968, :func:`gausim.models.template.solid.static_responses`):
 
-    a(X) = c + B_0 (X - o + sum_g Psi_g(X) (d_g, theta_g)),    A = grad a,    B = the rotation of A.
+    a(X) = c + B (X - o + sum_g Psi_g(X) (d_g, theta_g)),    A = grad a.
+
+All that the body does besides is relative to a and in the axes B, common to all units. The springs between units
+(:mod:`gausim.models.template.springs`), whose energy is that of their lengths at any rotation, start from B^T A.
 """
 
 from __future__ import annotations
@@ -56,10 +59,10 @@ class StaticShape:
         self.at = lru_cache(MOST_POSES)(self._at)
 
     def _at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor]:
-        """A (N, 3), B (N, 3, 3) and A (N, 3, 3) of the units at rest positions :attr:`rest`."""
-        count, identity = len(self.rest), torch.eye(3).expand(len(self.rest), 3, 3)
+        """A (N, 3), B (3, 3) and A (N, 3, 3) of the units at rest positions :attr:`rest`."""
+        count = len(self.rest)
         if pose is None:
-            return self.rest, identity, identity
+            return self.rest, torch.eye(3), torch.eye(3).expand(count, 3, 3)
         whole = self.with_still(HandPose(*(x.double().cpu() for x in (pose.rotations, pose.origins, pose.centres))))
         moved = whole.move(self._pins, self._holder)
         origin, centre = self._pins.mean(0), moved.mean(0)
@@ -79,7 +82,7 @@ class StaticShape:
             slope = torch.einsum("nabgc,gc->nab", self._slopes, amount)
         place = centre + (self.rest.double() - origin + displacement) @ base.mT
         gradient = base @ (torch.eye(3).double() + slope)
-        return place.float(), polar_rotation(gradient).float(), gradient.float()
+        return place.float(), base.float(), gradient.float()
 
     def kernels(self, pose: HandPose | None) -> Float[Tensor, "K 3"]:
         """Displacement of all kernels of the scene by the static shape [scene units]."""
@@ -144,7 +147,7 @@ class HeldBody(Body):
         place, rotation, gradient = self.at(pose)
         unit = self.unit_of_kernel.clamp_max(len(self.units) - 1)
         static = place[unit] + apply(gradient[unit], self.kernels - self.units[unit])
-        moved = self.kernels + _back(rotation[unit], positions - static)
+        moved = self.kernels + (positions - static) @ rotation
         still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
         return torch.where(still[:, None], self.kernels, moved)
 
@@ -153,7 +156,7 @@ class HeldBody(Body):
         return torch.eye(3).to(self.units)
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
-        """The units relative to the static shape, and the load of its acceleration, gravity and strain in its axes."""
+        """The units relative to the static shape, and the load of its acceleration, gravity and slope in its axes."""
         return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))
 
 
@@ -164,34 +167,28 @@ class HeldMotion(BodyMotion):
         self.body, self.state, self.hands = body, state, hands
         last, present, self.after = (body.at(pose) for pose in hands)
         acceleration = self.after[0] - 2 * present[0] + last[0] - body.gravity
-        pull = -_back(present[1], acceleration) - body.gravity  # at rest the body is in equilibrium with gravity
-        stretches = [rotation.mT @ gradient for _, rotation, gradient in (last, present, present, self.after)]
-        strain = torch.stack(stretches).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
-        load = torch.cat((pull, strain.flatten(1)), 1)
-        floor = None if body.contact is None else body.contact.nearness(now, present[1])
+        pull = -acceleration @ present[1] - body.gravity  # at rest the body is in equilibrium with gravity
+        slopes = [rotation.mT @ gradient for _, rotation, gradient in (last, present, present, self.after)]
+        slope = torch.stack(slopes).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
+        load = torch.cat((pull, slope.flatten(1)), 1)
+        floor = None if body.contact is None else body.contact.nearness(now, present[1].expand_as(slope))
         self.relative = UnitMotion(
-            body.units + _back(present[1], now - present[0]), body.units + _back(last[1], before - last[0]), load, floor
+            body.units + (now - present[0]) @ present[1], body.units + (before - last[0]) @ last[1], load, floor
         )
 
     def place(self, made: Placed) -> Placed:
         """The prediction about the static shape at t + 1; pinned kernels go where their hands are; then the floor."""
         body, identity = self.body, torch.eye(3).to(made.positions)
-        place, rotation, gradient = (torch.cat((x, y)) for x, y in zip(
-            self.after, (body.units.new_zeros(1, 3), identity[None], identity[None]), strict=True
-        ))  # fmt: skip
-        units = torch.cat((body.units, body.units.new_zeros(1, 3)))
-        unit = body.unit_of_kernel
-        offset = body.kernels - units[unit]
-        positions = place[unit] + apply(gradient[unit], offset) + apply(rotation[unit], made.positions - body.kernels)
+        nowhere, rotation = body.units.new_zeros(1, 3), self.after[1]
+        place, units = torch.cat((self.after[0], nowhere)), torch.cat((body.units, nowhere))
+        gradient, unit = torch.cat((self.after[2], identity[None])), body.unit_of_kernel
+        static = place[unit] + apply(gradient[unit], body.kernels - units[unit])
+        positions = static + (made.positions - body.kernels) @ rotation.mT
         if self.hands.after is not None:
             pose = body.shape.with_still(self.hands.after.to(positions))
             positions = torch.where((body.of < 0)[:, None], positions, pose.move(body.kernels, body.of.clamp_min(0)))
         deformation = gradient + rotation @ (made.deformation_gradients - identity)
-        placed = Placed(positions, deformation, rotation @ made.rotations)
+        placed = Placed(positions, deformation, polar_rotation(gradient) @ made.rotations)
         if body.contact is None:
             return placed
-        return body.contact.resolve(placed, self.state, body.elasticity, rotation[:-1], None)
-
-
-def _back(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    return apply(matrix.mT, vector)
+        return body.contact.resolve(placed, self.state, body.elasticity, rotation.expand_as(gradient[:-1]), None)

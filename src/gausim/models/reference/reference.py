@@ -47,7 +47,7 @@ class UnitMotion:
 
     now: Float[Tensor, "N 3"]
     before: Float[Tensor, "N 3"]
-    # in the reference's axes: acceleration [scene units / frame^2], and the reference's strain row by row
+    # in the reference's axes: acceleration [scene units / frame^2], and the reference's displacement gradient by rows
     load: Float[Tensor, "N 12"] | None
     # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
     floor: Float[Tensor, "N 4"] | None = None

@@ -149,11 +149,10 @@ class PreparedElastic(ModalScene):
     def __init__(self, scene: ElasticScene) -> None:
         """Computes the constants; loss gradients flow through them."""
         super().__init__(scene.projection, scene.modes, scene.gradients)
-        self.scene = scene
+        self.scene, self.springs = scene, scene.springs
+        self.factor = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
         a, b, e = scene.matrices()
-        self.transition = torch.cat((a.mT, -b.mT))
-        self.size = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-        self.turned = self.size * e.mT
+        self.transition, self.turned = torch.cat((a.mT, -b.mT)), self.factor * e.mT
         root, (stretch, mixing) = scene.inertia_root(), scene.roots()
         pull = (stretch[:, None] * mixing).mT @ root
         self.inertia, self.stiffness = root.mT @ root, pull.mT @ pull
@@ -161,10 +160,17 @@ class PreparedElastic(ModalScene):
         # I - A + B = E H^T K H: the restoring force of the trained stiffness, as it acts in a step.
         self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
 
-    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1}; the springs' contribution is limited to a fraction of the stiffness's."""
+    def after(
+        self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"], load: Float[Tensor, "S N 12"] | None = None
+    ) -> Float[Tensor, "S M"]:
+        """z_{t+1}; the springs' contribution is limited to a fraction of the stiffness's.
+
+        Under a load they may be taut at rest, so the step is implicit in their stiffness instead.
+        """
+        if load is not None:
+            return super().after(z, previous, load)
         linear = torch.cat((z, previous), -1) @ self.transition
-        return linear + limited(self.scene.springs(z) @ self.turned, z @ self.pull)
+        return linear + limited(self.springs(z) @ self.turned, z @ self.pull)
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a within the modes, and what density and stiffness add that are not even."""
@@ -180,7 +186,7 @@ class PreparedElastic(ModalScene):
         step, middle = z - previous, (z + previous) / 2
         heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT
         energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
-        return energy + self.size.detach() * self.scene.springs.potential(middle)
+        return energy + self.factor.detach() * self.springs.potential(middle)
 
 
 class ElasticTemplate(Template):

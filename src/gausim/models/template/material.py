@@ -77,7 +77,6 @@ class BodyModes(nn.Module):
     stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M); their sum is that of the homogeneous body
     strain: Tensor  # strain of the modes in the cells near each unit, row by row, times volume (N, 9, M)
     inertia: Tensor  # root of M_i, (N, 3, M)
-    links: Tensor  # pairs of units (2, E)
     stretch: Tensor  # root of S_ij, (E, M)
     between: Tensor  # root of T_ij, (E, 3, M)
     distance: Tensor  # logarithm of the links' lengths over their mean (E,)
@@ -118,8 +117,7 @@ class BodyModes(nn.Module):
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
-        self.springs = Springs(offset, change, (even / length) ** 2)
-        self.register_buffer("links", torch.from_numpy(pairs), persistent=False)
+        self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
         self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
 
 
@@ -159,6 +157,7 @@ class Matrices:
     density: Float[Tensor, " N"]  # of every unit over that at the beginning
     between: Float[Tensor, " E"]  # mass of every link in units of T_ij
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
+    tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
 
 
 class MaterialTemplate(Template):
@@ -236,7 +235,7 @@ class MaterialTemplate(Template):
         another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
-        a, b = (attributes.index_select(0, end) for end in body.links)
+        a, b = (attributes.index_select(0, end) for end in body.springs.ends)
         links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
         if not self.named_attributes:
             return _saturated(units), _saturated(links)
@@ -263,7 +262,8 @@ class MaterialTemplate(Template):
         dragged = root.mT @ (units[:, 2, None, None].exp() * heavy).flatten(0, 1)
         damping = drag * frame * dragged + viscosity / frame * k * stiffness
         uneven = k * (units[:, :2].exp() - 1)
-        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven)
+        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
+        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven, tense)
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, damping and density of the units as they enter K, D and M.
@@ -277,7 +277,7 @@ class MaterialTemplate(Template):
         factors = self.links.linear * links[:, 0].exp() + self.links.springs * links[:, 2].exp()
         size = 0.5 * body.stretch.square().sum(-1)
         own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
-        for end in body.links:
+        for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
             homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.links.springs) * size)
         drag = REFERENCE_FPS * (self.start[1] + DAMPING_GAIN * self.damping[0]).exp()
@@ -329,15 +329,8 @@ class PreparedMaterial(ModalScene):
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
-        self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
-
-    def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1} - 2 z_t + z_{t-1} (see the module's docstring)."""
-        nonlinear, stiffer = self.springs.linearised(z, self.matrices.links)
-        force = nonlinear - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
-        operator = self.operator + stiffer / 4
-        return torch.linalg.solve(operator, force[..., None])[..., 0]
+        self.factor = matrices.links
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.
@@ -345,10 +338,11 @@ class PreparedMaterial(ModalScene):
         And that of the strain of the reference, which is static for a homogeneous body: of the stiffness beyond it.
         """
         acceleration, strain = load.split((3, 9), -1)
-        first, second = (acceleration.index_select(1, end) for end in self.body.links)
+        first, second = (acceleration.index_select(1, end) for end in self.body.springs.ends)
         tied = self.body.tie * self.matrices.between[:, None] * (second - first)
         own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
         own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
+        own = own + self.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
     def correction_unit(self) -> Float[Tensor, ""] | None:
@@ -362,10 +356,6 @@ class PreparedMaterial(ModalScene):
         reference = self.reference * self.values.sum()
         pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
         return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
-
-    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1}."""
-        return 2 * z - previous + self.change(z, previous)
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """The projection of a displacement onto the modes.
@@ -381,4 +371,4 @@ class PreparedMaterial(ModalScene):
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.springs.potential(middle, self.matrices.links.detach())
+        return energy + self.springs.potential(middle, self.factor.detach())

@@ -29,32 +29,53 @@ class Springs(nn.Module):
 
     A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
     n = d_0 / |d_0|. The force is minus the derivative of their difference, so it has a potential and is of second order
-    in z; the linear part is in the trained matrices.
+    in z; the linear part is in the trained matrices. Where the reference of the modes is itself strained, by S, a
+    spring is already changed by S d_0: d = d_0 + S d_0 + Psi z, so that a taut body is stiffer to bending.
     """
 
     modes: Tensor  # Psi, differences of the modes between the ends, (3 E, M)
     offset: Tensor  # d_0 (E, 3) [scene units]
     length: Tensor  # |d_0| (E,) [scene units]
     stiffness: Tensor  # k (E,), up to the argument ``factor``
+    ends: Tensor  # the units between which each is (2, E)
 
-    def __init__(self, offset: np.ndarray, difference: np.ndarray, stiffness: np.ndarray) -> None:
-        """Springs along ``offset`` (E, 3), between whose ends the modes differ by ``difference`` (E, 3, M)."""
+    def __init__(self, ends: np.ndarray, rest: np.ndarray, phi: np.ndarray, stiffness: np.ndarray) -> None:
+        """Springs of ``stiffness`` (E,) between pairs (2, E) of units at ``rest`` (N, 3) with modes (N, 3, M)."""
         super().__init__()
+        offset = rest[ends[1]] - rest[ends[0]]
         arrays = {
-            "modes": difference.reshape(-1, difference.shape[-1]),
+            "modes": (phi[ends[1]] - phi[ends[0]]).reshape(-1, phi.shape[-1]),
             "offset": offset,
             "length": np.sqrt((offset**2).sum(1)),
             "stiffness": stiffness,
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(array).float(), persistent=False)
+        self.register_buffer("ends", torch.from_numpy(np.ascontiguousarray(ends)), persistent=False)
 
-    def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
+    def change(self, z: Float[Tensor, "S M"], strain: Float[Tensor, "S N 9"] | None = None) -> Float[Tensor, "S E 3"]:
+        """Change of every spring by the modes and by the strain of the reference at the units."""
+        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+        return change if strain is None else change + self.strained(strain)
+
+    def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S E 3"]:
+        """S d_0 of every spring, S the mean of both ends."""
+        both = strain.index_select(1, self.ends.flatten()).unflatten(1, (2, -1)).mean(1)
+        return (both.unflatten(-1, (3, 3)) @ self.offset[..., None])[..., 0]
+
+    def pull(self, strain: Float[Tensor, "S N 9"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
+        """Linear part of the modal forces of a strained reference."""
+        along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
+        return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
+
+    def forward(
+        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
+    ) -> Float[Tensor, "S M"]:
         """Nonlinear part of the modal forces; ``factor`` on the stiffness, one number or one per spring (E,)."""
-        return self._force(self._stretched(z), factor)
+        return self._force(self._stretched(self.change(z, strain)), factor)
 
     def linearised(
-        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0
+        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
     ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M M"]]:
         """The nonlinear force at ``z`` and the change of the stiffness from rest to ``z``.
 
@@ -62,7 +83,7 @@ class Springs(nn.Module):
         of length |d| and direction n (at rest n n^T). Compressed springs (t < 0) buckle; for them t is set to 0, so
         that the stiffness at ``z`` is positive semi-definite.
         """
-        stretched = self._stretched(z)
+        stretched = self._stretched(self.change(z, strain))
         change, _, _, now, stretch = stretched
         towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
         t = (stretch / now).clamp_min(0)[..., None, None]
@@ -81,12 +102,11 @@ class Springs(nn.Module):
 
     def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
         """Potential energy of the force of :meth:`forward`."""
-        _, squared, along, _, stretch = self._stretched(z)
+        _, squared, along, _, stretch = self._stretched(self.change(z))
         return 0.5 * (factor * self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
 
-    def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, ...]:
-        """Psi z, |d_0|^2, d_0 . Psi z, |d| and |d| - |d_0| of every spring."""
-        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+    def _stretched(self, change: Float[Tensor, "S E 3"]) -> tuple[Tensor, ...]:
+        """D - d_0, |d_0|^2, d_0 . (d - d_0), |d| and |d| - |d_0| of every spring."""
         squared = self.length.square()
         along = (self.offset * change).sum(-1)
         grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
@@ -106,7 +126,7 @@ def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
     blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
     first = difference[:, :, 0]
     lowest = np.einsum("ea,eab,eb->", first, blocks, first)
-    return Springs(offset, difference, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
+    return Springs(pairs.T, rest, phi, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
 
 
 def limited(added: Float[Tensor, "S M"], pull: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:

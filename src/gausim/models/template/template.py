@@ -21,6 +21,7 @@ from gausim.models.hierarchy.batch import SceneBatch, rows_by_scene
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import FIRST, SECOND
+from gausim.models.template.springs import Springs
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
@@ -139,6 +140,8 @@ class ModalScene(ABC):
     inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
     stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
     damping: Float[Tensor, "M M"]  # modal damping
+    springs: Springs  # nonlinear
+    factor: Tensor  # on the springs' stiffness, of all or of each (E,)
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -152,15 +155,8 @@ class ModalScene(ABC):
         self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], load: Float[Tensor, "S N 12"] | None = None
     ) -> Float[Tensor, "S N 12"]:
         """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
-        after = self.after(*self.coordinates(now, before))
-        if load is not None:
-            after = after + self.response(load)
+        after = self.after(*self.coordinates(now, before), load)
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
-
-    def response(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
-        """What a load adds to z_{t+1} (:class:`gausim.models.reference.reference.UnitMotion`)."""
-        operator = self.inertia + self.stiffness / 4 + self.damping / 2
-        return torch.linalg.solve(operator, self.force(load).mT).mT
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Modal force of a load; here Phi^T M a of the part of its accelerations a that is within the modes."""
@@ -181,9 +177,21 @@ class ModalScene(ABC):
         """Factor on the network's output; None for a factor of 1."""
         return None
 
-    @abstractmethod
-    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1}."""
+    def after(
+        self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"], load: Float[Tensor, "S N 12"] | None = None
+    ) -> Float[Tensor, "S M"]:
+        """z_{t+1}, under a load (:class:`gausim.models.reference.reference.UnitMotion`).
+
+        A step of the trapezoidal rule with the springs' force f linearised within it, J the change of their stiffness:
+
+            (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t) + load
+        """
+        nonlinear, stiffer = self.springs.linearised(z, self.factor, None if load is None else load[..., 3:])
+        force = nonlinear - z @ self.stiffness.mT - (z - previous) @ self.damping.mT
+        if load is not None:
+            force = force + self.force(load)
+        operator = self.inertia + (self.stiffness + stiffer) / 4 + self.damping / 2
+        return 2 * z - previous + torch.linalg.solve(operator, force[..., None])[..., 0]
 
     @abstractmethod
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
@@ -196,7 +204,7 @@ def force_of_strain(
     """-sum_n (2 mu u_n0 S_n + lambda u_n1 tr S_n) : E_n, the modal force of a strain S of the reference.
 
     Args:
-        strain: S of every unit, row by row.
+        strain: displacement gradient S of every unit, row by row; its antisymmetric part does nothing.
         uneven: stiffness of shear and of volume beyond that of the homogeneous body [1 / frame^2].
         modes: E, strain of the modes near each unit times volume, as ``SolidBody.strains`` gives it.
     """
