@@ -60,7 +60,7 @@ class Coordinates:
     """Coordinates of a body's deviation in one frame: its modes, and six of its rigid motion where it is free."""
 
     body: Elasticity
-    rotation: Float[Tensor, "N 3 3"]  # from the modes' axes to scene axes
+    rotation: Float[Tensor, "3 3"]  # from the modes' axes to scene axes
     centre: Float[Tensor, " 3"] | None  # of a free body
     inertia: Float[Tensor, "C C"]
     stiffness: Float[Tensor, "C C"]
@@ -68,7 +68,7 @@ class Coordinates:
 
     @classmethod
     def of(
-        cls, body: Elasticity, positions: Float[Tensor, "K 3"], rotation: Tensor, centre: Tensor | None
+        cls, body: Elasticity, positions: Float[Tensor, "K 3"], rotation: Float[Tensor, "3 3"], centre: Tensor | None
     ) -> Coordinates:
         """The coordinates about the ``positions`` of a frame."""
         inertia, stiffness, damping = body.matrices
@@ -80,7 +80,7 @@ class Coordinates:
             rigid = torch.block_diag(torch.eye(3).to(arm), turning) * body.mass
             inertia = torch.block_diag(inertia, rigid)
             stiffness, damping = torch.block_diag(stiffness, none), torch.block_diag(damping, none)
-        return cls(body, rotation.expand(len(body.modes), 3, 3), centre, inertia, stiffness, damping)
+        return cls(body, rotation, centre, inertia, stiffness, damping)
 
     def jacobian(
         self, points: Int[Tensor, " P"], positions: Float[Tensor, "K 3"], axes: Float[Tensor, "3 3"]
@@ -88,7 +88,7 @@ class Coordinates:
         """Displacements of kernels along the axes per coordinate."""
         body, unit = self.body, self.body.unit_of_kernel[points]
         local = body.modes[unit] + torch.einsum("cabm,cb->cam", body.slopes[unit], body.offset[points])
-        rows = torch.einsum("da,cab,cbm->cdm", axes, self.rotation[unit], local)
+        rows = torch.einsum("da,ab,cbm->cdm", axes, self.rotation, local)
         if self.centre is not None:
             arms = -axes @ cross_matrix(positions[points] - self.centre)
             rows = torch.cat((rows, axes.expand(len(points), 3, 3), arms), -1)
@@ -100,8 +100,8 @@ class Coordinates:
         """Displaced kernels, the change of the units' deformation gradients, and the rotation of the whole."""
         body, unit = self.body, self.body.unit_of_kernel
         modal, none = amount[: body.modes.shape[-1]], positions.new_zeros(1, 3, 3)
-        shift = torch.einsum("nab,nbm,m->na", self.rotation, body.modes, modal)
-        slope = torch.cat((torch.einsum("nab,nbcm,m->nac", self.rotation, body.slopes, modal), none))
+        shift = torch.einsum("ab,nbm,m->na", self.rotation, body.modes, modal)
+        slope = torch.cat((torch.einsum("ab,nbcm,m->nac", self.rotation, body.slopes, modal), none))
         moved = positions + torch.cat((shift, none[0, :1]))[unit] + apply(slope[unit], body.offset)
         turn = torch.eye(3).to(positions)
         if self.centre is not None:
@@ -120,20 +120,18 @@ class Contact:
     restitution: Float[Tensor, ""]
     diagonal: float  # of the scene [scene units]
 
-    def nearness(
-        self, centres: Float[Tensor, "N 3"], rotation: Float[Tensor, "3 3"] | Float[Tensor, "N 3 3"]
-    ) -> Float[Tensor, "N 4"]:
+    def nearness(self, centres: Float[Tensor, "N 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "N 4"]:
         """Nearness p = (1 - h / (0.2 diagonals))^2 of units at height h, 0 beyond; and p times the turned-back normal.
 
         Args:
             centres: centres of mass of the units, in the scene [scene units].
-            rotation: of the body or of every unit, from its axes to scene axes.
+            rotation: from the axes of the body to scene axes.
         """
         near = (1 - self.floor.height(centres) / (REACH * self.diagonal)).clamp(0, 1).square()[:, None]
         return torch.cat((near, near * (centres.new_tensor(self.floor.normal) @ rotation)), 1)
 
     def resolve(
-        self, placed: Placed, state: SimState, body: Elasticity, rotation: Tensor, centre: Tensor | None
+        self, placed: Placed, state: SimState, body: Elasticity, rotation: Float[Tensor, "3 3"], centre: Tensor | None
     ) -> Placed:
         """A predicted frame, with the impulses of the floor; no kernel is left below it.
 
@@ -141,7 +139,7 @@ class Contact:
             placed: the prediction without the floor, in scene axes.
             state: positions at t and t - 1.
             body: how the body yields.
-            rotation: (3, 3) of the whole body, or (N, 3, 3) of every unit, from the modes' axes to scene axes.
+            rotation: from the modes' axes to scene axes.
             centre: centre of mass (3,) of a free body at t + 1; None for a held one.
         """
         points = self._points(placed.positions, state, body)

@@ -58,11 +58,11 @@ class StaticShape:
             self._centres, self._modes, self._slopes = (torch.from_numpy(np.ascontiguousarray(x)) for x in arrays)
         self.at = lru_cache(MOST_POSES)(self._at)
 
-    def _at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor]:
-        """A (N, 3), B (3, 3) and A (N, 3, 3) of the units at rest positions :attr:`rest`."""
-        count = len(self.rest)
+    def _at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The places a (N, 3), the axes B (3, 3), A and its rotations (N, 3, 3) of the units at :attr:`rest`."""
+        count, identity = len(self.rest), torch.eye(3)
         if pose is None:
-            return self.rest, torch.eye(3), torch.eye(3).expand(count, 3, 3)
+            return self.rest, identity, identity.expand(count, 3, 3), identity.expand(count, 3, 3)
         whole = self.with_still(HandPose(*(x.double().cpu() for x in (pose.rotations, pose.origins, pose.centres))))
         moved = whole.move(self._pins, self._holder)
         origin, centre = self._pins.mean(0), moved.mean(0)
@@ -82,11 +82,11 @@ class StaticShape:
             slope = torch.einsum("nabgc,gc->nab", self._slopes, amount)
         place = centre + (self.rest.double() - origin + displacement) @ base.mT
         gradient = base @ (torch.eye(3).double() + slope)
-        return place.float(), base.float(), gradient.float()
+        return place.float(), base.float(), gradient.float(), polar_rotation(gradient).float()
 
     def kernels(self, pose: HandPose | None) -> Float[Tensor, "K 3"]:
         """Displacement of all kernels of the scene by the static shape [scene units]."""
-        place, _, gradient = self.at(pose)
+        place, _, gradient, _ = self.at(pose)
         own = self.of_kernel >= 0
         unit, rest = self.of_kernel[own], self._scene_rest[own]
         moved = place[unit] - rest + apply(gradient[unit], rest - self.rest[unit])
@@ -132,11 +132,11 @@ class HeldBody(Body):
         self.gravity, self.contact, self.elasticity = gravity, contact, elasticity
         self.of = shape.of.to(kernels.device)
 
-    def at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor]:
-        """a, B and A at the units' centres of mass, which depend on the learned densities."""
-        place, rotation, gradient = (x.to(self.units) for x in self.shape.at(pose))
+    def at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As :meth:`StaticShape._at`, at the units' centres of mass, which depend on the learned densities."""
+        place, axes, gradient, turns = (x.to(self.units) for x in self.shape.at(pose))
         offset = self.units - self.shape.rest.to(self.units)
-        return place + apply(gradient, offset), rotation, gradient
+        return place + apply(gradient, offset), axes, gradient, turns
 
     def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
         """The kernels relative to the static shape."""
@@ -144,10 +144,10 @@ class HeldBody(Body):
         return SimState(self._relative(state.positions, hands.now), self._relative(state.previous, hands.before))
 
     def _relative(self, positions: Tensor, pose: HandPose | None) -> Tensor:
-        place, rotation, gradient = self.at(pose)
+        place, axes, gradient, _ = self.at(pose)
         unit = self.unit_of_kernel.clamp_max(len(self.units) - 1)
         static = place[unit] + apply(gradient[unit], self.kernels - self.units[unit])
-        moved = self.kernels + (positions - static) @ rotation
+        moved = self.kernels + (positions - static) @ axes
         still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
         return torch.where(still[:, None], self.kernels, moved)
 
@@ -168,10 +168,10 @@ class HeldMotion(BodyMotion):
         last, present, self.after = (body.at(pose) for pose in hands)
         acceleration = self.after[0] - 2 * present[0] + last[0] - body.gravity
         pull = -acceleration @ present[1] - body.gravity  # at rest the body is in equilibrium with gravity
-        slopes = [rotation.mT @ gradient for _, rotation, gradient in (last, present, present, self.after)]
+        slopes = [axes.mT @ gradient for _, axes, gradient, _ in (last, present, present, self.after)]
         slope = torch.stack(slopes).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
         load = torch.cat((pull, slope.flatten(1)), 1)
-        floor = None if body.contact is None else body.contact.nearness(now, present[1].expand_as(slope))
+        floor = None if body.contact is None else body.contact.nearness(now, present[1])
         self.relative = UnitMotion(
             body.units + (now - present[0]) @ present[1], body.units + (before - last[0]) @ last[1], load, floor
         )
@@ -179,16 +179,16 @@ class HeldMotion(BodyMotion):
     def place(self, made: Placed) -> Placed:
         """The prediction about the static shape at t + 1; pinned kernels go where their hands are; then the floor."""
         body, identity = self.body, torch.eye(3).to(made.positions)
-        nowhere, rotation = body.units.new_zeros(1, 3), self.after[1]
+        nowhere, axes, unit = body.units.new_zeros(1, 3), self.after[1], body.unit_of_kernel
         place, units = torch.cat((self.after[0], nowhere)), torch.cat((body.units, nowhere))
-        gradient, unit = torch.cat((self.after[2], identity[None])), body.unit_of_kernel
+        gradient, turns = (torch.cat((x, identity[None])) for x in self.after[2:])
         static = place[unit] + apply(gradient[unit], body.kernels - units[unit])
-        positions = static + (made.positions - body.kernels) @ rotation.mT
+        positions = static + (made.positions - body.kernels) @ axes.mT
         if self.hands.after is not None:
             pose = body.shape.with_still(self.hands.after.to(positions))
             positions = torch.where((body.of < 0)[:, None], positions, pose.move(body.kernels, body.of.clamp_min(0)))
-        deformation = gradient + rotation @ (made.deformation_gradients - identity)
-        placed = Placed(positions, deformation, polar_rotation(gradient) @ made.rotations)
+        deformation = gradient + axes @ (made.deformation_gradients - identity)
+        placed = Placed(positions, deformation, turns @ made.rotations)
         if body.contact is None:
             return placed
-        return body.contact.resolve(placed, self.state, body.elasticity, rotation.expand_as(gradient[:-1]), None)
+        return body.contact.resolve(placed, self.state, body.elasticity, axes, None)

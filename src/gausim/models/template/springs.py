@@ -68,11 +68,9 @@ class Springs(nn.Module):
         along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
         return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
 
-    def forward(
-        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
-    ) -> Float[Tensor, "S M"]:
+    def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
         """Nonlinear part of the modal forces; ``factor`` on the stiffness, one number or one per spring (E,)."""
-        return self._force(self._stretched(self.change(z, strain)), factor)
+        return self._force(self._stretched(self.change(z)), factor)
 
     def linearised(
         self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
