@@ -10,11 +10,11 @@ from helpers.bodies import NEURAL, make_model
 
 from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
 from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
-from gausim.models.reference.floor import _projected_gradients, _solved
+from gausim.models.reference.floor import COMPLIANCE, Contact, _projected_gradients, _solved
 from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.predictor import with_floor_columns
-from gausim.ops.rotation import rotation_of, rotation_vector
+from gausim.ops.rotation import cross_matrix, rotation_of, rotation_vector
 
 TURN = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
 FLOOR = Floor((0.0, 0.0, -0.3), (0.0, 0.0, 1.0), friction=0.4, restitution=0.0)
@@ -193,6 +193,26 @@ def test_impulses_obey_the_laws_of_contact_and_their_equations_agree() -> None:
     pressing = smooth.view(-1, 3)[:, 0] > 1e-9
     equal = _solved(w, b, pressing, pressing, torch.zeros(4, 2).double())
     torch.testing.assert_close(equal, smooth, atol=1e-7, rtol=0)
+
+
+def test_loss_gradients_of_many_near_contacts_tell_of_their_sum_only() -> None:
+    corners = torch.rand(10, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    corners = torch.cat((corners[:, :2] - corners[:, :2].mean(0), torch.zeros(10, 1).double()), 1)
+    rows = torch.cat((torch.eye(3).double().expand(10, 3, 3), -cross_matrix(corners)), -1)
+    body = rows[:, [2, 0, 1]].flatten(0, 1)  # a rigid plate: along the normal and two tangents, by six coordinates
+    spread = body @ body.mT
+    spread = spread + COMPLIANCE * spread.diagonal().mean() * torch.eye(30).double()
+    contact = Contact(FLOOR, torch.tensor(5.0).double(), torch.tensor(0.0).double(), 1.0)
+    wanted, guess, pressing = -body[:, 2], torch.zeros(30).double(), torch.ones(10, dtype=torch.bool)
+    for _ in range(20):
+        guess = contact._impulses(spread, wanted, guess)[1]
+    found = torch.autograd.functional.jacobian(lambda b: contact._impulses(spread, b, guess)[0], wanted)
+    exact = torch.autograd.functional.jacobian(
+        lambda b: _solved(spread, b, pressing, ~pressing, torch.zeros(10, 2).double()), wanted
+    )
+    assert found.abs().max() < 0.03 * exact.abs().max()  # how the points share an impulse
+    whole, right = body.mT @ found @ body, body.mT @ exact @ body  # what becomes of the plate
+    assert (whole - right).norm() < 0.1 * right.norm()
 
 
 def test_loss_gradients_flow_through_an_impact() -> None:

@@ -11,7 +11,8 @@ Signorini's and Coulomb's laws for the gap g, which is at least g_min, and the s
     p_n >= 0, g >= g_min, p_n (g - g_min) = 0        |p_t| <= mu p_n, against s
 
 and are found by projected gradients on the friction cones (Mazhar, Heyn, Negrut and Tasora 2015). Loss gradients are
-those of the linear equations that hold as long as the same points press, stick and slide.
+those of the linear equations that hold as long as the same points press, stick and slide, on a softer floor: how the
+impulse is shared among near points is almost undetermined, and its exact derivatives would drown all others.
 
 After the frame the body has the deviation q and its velocity v. The trapezoidal step of a frame keeps the amplitude of
 every mode if it starts from q at t + 1 and, at t, from q - (M + K / 4)^-1 (K q / 2 + M v).
@@ -32,6 +33,8 @@ from gausim.ops.rotation import cross_matrix, rotation_of
 
 # Added to the diagonal of J (M + ...)^-1 J^T, as a fraction of its mean: near contact points are hardly independent.
 COMPLIANCE = 1e-3
+# The same for the equations that loss gradients are taken from.
+GRADIENT_COMPLIANCE = 0.05
 SUBSTEPS, ITERATIONS = 8, 30
 # A unit takes part in a frame's contact if its lowest kernel comes nearer to the floor [fractions of the body's size].
 NEAR = 0.05
@@ -217,7 +220,8 @@ class Contact:
             direction = (found[:, 1:] / size.clamp_min(1e-30)[:, None]).to(wanted)
         if not torch.is_grad_enabled():
             return solved.to(wanted), solved
-        equal = _solved(spread, wanted, pressing, sliding, direction * self.friction)
+        softer = spread + GRADIENT_COMPLIANCE * spread.diagonal().mean() * torch.eye(len(spread)).to(spread)
+        equal = _solved(softer, wanted, pressing, sliding, direction * self.friction)
         return solved.to(wanted) + (equal - equal.detach()), solved
 
 
