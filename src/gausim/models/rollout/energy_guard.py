@@ -29,12 +29,13 @@ class EnergyGuard:
         s = (limit - E_0) / (E_1 - E_0)
 
     on the network's output, where E_0 and E_1 are the energies at s = 0 and s = 1. E is convex in the state, so the
-    repeated step stays below the limit as far as the state is linear in s. If it does not, or if the template alone
-    exceeds the limit (the nonlinear spring forces are integrated explicitly), the step of the template alone is taken.
+    repeated step stays below the limit as far as the state is linear in s. If it does not, the step of the template
+    alone is taken, which adds no energy.
 
-    Far outside the motion seen in training the explicit springs are unstable, and strong forces could lead there. A
-    ``ceiling`` prevents this: a force that would exceed it is reduced to a fraction, and a step that still exceeds it
-    is shortened to the longest fraction below it. The ceiling thus bounds the deformation that forces can cause.
+    Far outside the motion seen in training neither template nor network means anything, and strong forces could lead
+    there. A ``ceiling`` prevents this: a force that would exceed it is reduced to a fraction, and a step that still
+    exceeds it is shortened to the longest fraction below it. The ceiling thus bounds the deformation that forces can
+    cause.
     """
 
     def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, *, ceiling: float | None = None) -> None:

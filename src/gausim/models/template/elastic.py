@@ -1,14 +1,11 @@
 """An elastic template: learned elastodynamics in the vibration modes of a solid body.
 
 With u the displacement of the units and Phi the lowest mass-orthonormal modes of the body that the kernels bound,
-z = Phi^T M u obeys z'' + D z' + K z = f(z). One frame is one step of the trapezoidal rule in two-step form,
-
-    (I + K/4 + D/2) z_{t+1} = (2 I - K/2) z_t - (I + K/4 - D/2) z_{t-1} + f(z_t)     [frame units]
-
-which is stable for all positive semi-definite K and D and creates no energy; with D = 0 it conserves energy. K and D
-are trained as products S L L^T S around the body's spectrum, so that the modes may mix. f is the nonlinear part of the
-force of springs between the units. Trained inertia allows masses that differ from the units' volumes: z above is
-replaced by H z with a trained matrix H, hence inertia H^T H; stability and energy conservation are unaffected.
+z = Phi^T M u obeys z'' + D z' + K z = f(z), f being the nonlinear part of the force of springs between the units. A
+frame is the step that all modal templates have in common (:class:`gausim.models.template.template.ModalScene`), which
+creates no energy whatever positive semi-definite K and D are. They are trained as products S L L^T S around the body's
+spectrum, so that the modes may mix. Trained inertia allows masses that differ from the units' volumes: z above is
+replaced by H z with a trained matrix H, hence inertia H^T H.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import solid_body
-from gausim.models.template.springs import limited, unit_springs
+from gausim.models.template.springs import unit_springs
 from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template, force_of_strain
 
 # Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
@@ -130,18 +127,6 @@ class ElasticScene(nn.Module):
         lost = (pushed * (self.dissipation() @ pushed)).sum(0)
         return lost.view(-1, 3).sum(1) / pushed.square().sum(0).view(-1, 3).sum(1)
 
-    def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
-        """A, B and E of z_{t+1} = A z_t - B z_{t-1} + E f."""
-        identity = self._identity()
-        root, mixing = self.roots()
-        factor = root[:, None] * mixing
-        stiffness, damping = factor @ factor.mT, self.dissipation()
-        inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
-        now, before = inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2)
-        inertia = self.inertia_root()
-        back = torch.linalg.inv(inertia)
-        return back @ now @ inertia, back @ before @ inertia, back @ inverse @ back.mT
-
 
 class PreparedElastic(ModalScene):
     """Matrices of a scene's step between two updates of the parameters."""
@@ -151,26 +136,10 @@ class PreparedElastic(ModalScene):
         super().__init__(scene.projection, scene.modes, scene.gradients)
         self.scene, self.springs = scene, scene.springs
         self.factor = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-        a, b, e = scene.matrices()
-        self.transition, self.turned = torch.cat((a.mT, -b.mT)), self.factor * e.mT
         root, (stretch, mixing) = scene.inertia_root(), scene.roots()
         pull = (stretch[:, None] * mixing).mT @ root
         self.inertia, self.stiffness = root.mT @ root, pull.mT @ pull
         self.damping = root.mT @ scene.dissipation() @ root
-        # I - A + B = E H^T K H: the restoring force of the trained stiffness, as it acts in a step.
-        self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
-
-    def after(
-        self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"], load: Float[Tensor, "S N 12"] | None = None
-    ) -> Float[Tensor, "S M"]:
-        """z_{t+1}; the springs' contribution is limited to a fraction of the stiffness's.
-
-        Under a load they may be taut at rest, so the step is implicit in their stiffness instead.
-        """
-        if load is not None:
-            return super().after(z, previous, load)
-        linear = torch.cat((z, previous), -1) @ self.transition
-        return linear + limited(self.springs(z) @ self.turned, z @ self.pull)
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a within the modes, and what density and stiffness add that are not even."""
@@ -181,7 +150,7 @@ class PreparedElastic(ModalScene):
         return own + force_of_strain(strain, scale * uneven, self.scene.strains)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """|H v|^2 / 2 + (H m)^T K H m / 2 + the springs' nonlinear part; conserved without damping and springs."""
+        """|H v|^2 / 2 + (H m)^T K H m / 2 + the springs' nonlinear part; conserved without damping."""
         root, mixing = (x.detach() for x in self.scene.roots())
         step, middle = z - previous, (z + previous) / 2
         heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT

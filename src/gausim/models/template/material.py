@@ -16,13 +16,9 @@ a_j1 to p and g. These factors give, in modal coordinates z,
     D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                damping
 
 k, c_0 and c_1 are trained numbers common to all scenes. The links of stiffness e^{g_ij} are springs with geometric
-nonlinearity: f is the nonlinear part of their force, J the change of their stiffness from rest to z_t. One frame is one
-step of the trapezoidal rule, with the force linearised within it,
-
-    (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t)     [frame units]
-
-K, K + J, M and D are positive semi-definite for all decoded values. Without f a step never creates energy, and without
-damping it conserves energy. f has a potential, too, and a step that is implicit in its derivative does not amplify
+nonlinearity. A frame is the step that all modal templates have in common
+(:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
+that a step never creates energy, and without damping it conserves energy. It does not amplify
 vibrations too fast for the frame rate. The decoders' only geometric input are distances, so that they generalise to
 other bodies and orientations.
 """
@@ -367,7 +363,7 @@ class PreparedMaterial(ModalScene):
         return (z @ self.positions.mT).view_as(displacement)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 + the links' nonlinear part; conserved without damping and that part."""
+        """v^T M v / 2 + m^T K m / 2 + the links' nonlinear part; conserved without damping."""
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)

@@ -10,9 +10,6 @@ from torch import Tensor, nn
 
 # Fraction of a spring's stiffness that acts across its direction: central forces alone leave soft mechanisms.
 TRANSVERSE_STIFFNESS = 0.3
-# Largest ratio of the springs' nonlinear contribution to a step over that of the trained stiffness: the nonlinear force
-# is integrated explicitly and is unstable for large rotations of thin parts.
-LARGEST_NONLINEAR = 0.5
 
 
 def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
@@ -68,28 +65,37 @@ class Springs(nn.Module):
         along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
         return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
 
-    def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
-        """Nonlinear part of the modal forces; ``factor`` on the stiffness, one number or one per spring (E,)."""
-        return self._force(self._stretched(self.change(z)), factor)
-
-    def linearised(
+    def stiffening(
         self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
-    ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M M"]]:
-        """The nonlinear force at ``z`` and the change of the stiffness from rest to ``z``.
+    ) -> Float[Tensor, "S M M"]:
+        """The change of the stiffness from rest to ``z``.
 
         The stiffness is the second derivative of the energy: (1 - t) n n^T + t I with t = 1 - |d_0| / |d| for a spring
         of length |d| and direction n (at rest n n^T). Compressed springs (t < 0) buckle; for them t is set to 0, so
         that the stiffness at ``z`` is positive semi-definite.
         """
-        stretched = self._stretched(self.change(z, strain))
-        change, _, _, now, stretch = stretched
+        change, _, _, now, stretch = self._stretched(self.change(z, strain))
         towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
         t = (stretch / now).clamp_min(0)[..., None, None]
         blocks = (1 - t) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
         blocks = blocks + t * torch.eye(3, dtype=z.dtype, device=z.device)
         modes = self.modes.unflatten(0, (-1, 3))
         turned = ((factor * self.stiffness)[:, None, None] * blocks) @ modes
-        return self._force(stretched, factor), self.modes.mT @ turned.flatten(-3, -2)
+        return self.modes.mT @ turned.flatten(-3, -2)
+
+    def between(
+        self,
+        first: Float[Tensor, "S M"],
+        second: Float[Tensor, "S M"],
+        factor: Tensor | float = 1.0,
+        strain: Float[Tensor, "S N 9"] | None = None,
+    ) -> Float[Tensor, "S M"]:
+        """Mean nonlinear force from one state to another, whose work is exactly the loss of :meth:`potential`.
+
+        A spring pulls along the mean of both d as one of the mean of both lengths does (Simo and Tarnow 1992).
+        """
+        both = (self._stretched(self.change(z, strain)) for z in (first, second))
+        return self._force(tuple((a + b) / 2 for a, b in zip(*both, strict=True)), factor)
 
     def _force(self, stretched: tuple[Tensor, ...], factor: Tensor | float) -> Tensor:
         change, squared, along, now, stretch = stretched
@@ -99,7 +105,7 @@ class Springs(nn.Module):
         return -(nonlinear.flatten(-2) @ self.modes)
 
     def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
-        """Potential energy of the force of :meth:`forward`."""
+        """Potential energy of the nonlinear force."""
         _, squared, along, _, stretch = self._stretched(self.change(z))
         return 0.5 * (factor * self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
 
@@ -125,10 +131,3 @@ def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
     first = difference[:, :, 0]
     lowest = np.einsum("ea,eab,eb->", first, blocks, first)
     return Springs(pairs.T, rest, phi, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
-
-
-def limited(added: Float[Tensor, "S M"], pull: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-    """The springs' contribution to a step, limited to :data:`LARGEST_NONLINEAR` times the norm of the stiffness's."""
-    bound = LARGEST_NONLINEAR * torch.linalg.vector_norm(pull, dim=-1, keepdim=True).detach()
-    size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
-    return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)

@@ -26,6 +26,8 @@ from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
+# Corrections of a step for the springs: fewer lose energy in large swings, none adds any.
+CORRECTIONS = 4
 DENSITY = "density over that at the beginning of training"
 
 
@@ -182,16 +184,25 @@ class ModalScene(ABC):
     ) -> Float[Tensor, "S M"]:
         """z_{t+1}, under a load (:class:`gausim.models.reference.reference.UnitMotion`).
 
-        A step of the trapezoidal rule with the springs' force f linearised within it, J the change of their stiffness:
+        A step of the trapezoidal rule, with the mean f of the springs' force between m_- = (z_t + z_{t-1}) / 2 and
+        m_+ = (z_{t+1} + z_t) / 2:
 
-            (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t) + load
+            M (z_{t+1} - 2 z_t + z_{t-1}) = f(m_-, m_+) - K (m_- + m_+) / 2 - D (z_{t+1} - z_{t-1}) / 2 + load
+
+        Without damping and load it conserves :meth:`energy` exactly. It is solved by corrections with the stiffness at
+        z_t; loss gradients are those of the corrections.
         """
-        nonlinear, stiffer = self.springs.linearised(z, self.factor, None if load is None else load[..., 3:])
-        force = nonlinear - z @ self.stiffness.mT - (z - previous) @ self.damping.mT
-        if load is not None:
-            force = force + self.force(load)
-        operator = self.inertia + (self.stiffness + stiffer) / 4 + self.damping / 2
-        return 2 * z - previous + torch.linalg.solve(operator, force[..., None])[..., 0]
+        strain, own = (None, 0.0) if load is None else (load[..., 3:], self.force(load))
+        inertia, stiffness, damping = self.inertia, self.stiffness, self.damping
+        with torch.no_grad():
+            stiffer = self.springs.stiffening(z, self.factor, strain)
+            operator = torch.linalg.lu_factor(inertia + (stiffness + stiffer) / 4 + damping / 2)
+        speed, bend = z - previous, torch.zeros_like(z)
+        for _ in range(CORRECTIONS):
+            nonlinear = self.springs.between(z - speed / 2, z + (speed + bend) / 2, self.factor, strain)
+            force = nonlinear - (z + bend / 4) @ stiffness.mT - (speed + bend / 2) @ damping.mT + own
+            bend = bend + torch.linalg.lu_solve(*operator, (force - bend @ inertia.mT)[..., None])[..., 0]
+        return z + speed + bend
 
     @abstractmethod
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
