@@ -168,26 +168,29 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
     change = first[j] - first[i]
     lowest = ((0.7 * (change * offset).sum(-1).square() / length**2 + 0.3 * change.square().sum(-1)) / length**2).sum()
     generator = torch.Generator().manual_seed(3)
+
+    def still(z: torch.Tensor) -> torch.Tensor:
+        return springs.between(*[springs.stretched(z[None])] * 2)
+
     for size in (0.3, 3.0):
         z = (size * scene.scale * torch.randn(9, generator=generator, dtype=torch.float64)).requires_grad_()
         expected = -torch.autograd.grad(energy(z), z)[0] / lowest
         torch.testing.assert_close(
-            springs.between(z.detach()[None], z.detach()[None])[0],
+            still(z.detach())[0],
             expected,
             rtol=1e-3,
             atol=1e-4 * float(expected.norm()),
         )
         z = z.detach()
-        potential, expected = springs.potential(z[None])[0], energy(z) / lowest
+        potential, expected = springs.potential(springs.stretched(z[None]))[0], energy(z) / lowest
         torch.testing.assert_close(potential, expected, rtol=1e-3, atol=1e-5 * float(expected.abs()))
-    pulls = [float(springs.between(s * z[None], s * z[None]).norm()) for s in (1e-3, 2e-3)]
-    assert pulls[1] / pulls[0] == pytest.approx(4, rel=0.02) and not bool(
-        springs.between(0 * z[None], 0 * z[None]).any()
-    )
+    pulls = [float(still(s * z).norm()) for s in (1e-3, 2e-3)]
+    assert pulls[1] / pulls[0] == pytest.approx(4, rel=0.02) and not bool(still(0 * z).any())
     # Between two states they do the work that their potential loses.
     other = z + 2 * scene.scale * torch.randn(9, generator=generator, dtype=torch.float64)
-    work = springs.between(z[None], other[None])[0] @ (other - z)
-    assert float(work) == pytest.approx(float(springs.potential(z[None]) - springs.potential(other[None])), rel=1e-4)
+    ends = [springs.stretched(q[None]) for q in (z, other)]
+    work, lost = springs.between(*ends)[0] @ (other - z), springs.potential(ends[0]) - springs.potential(ends[1])
+    assert float(work) == pytest.approx(float(lost), rel=1e-4)
 
 
 @pytest.mark.parametrize("size", [0.1, 3.0, 100.0])
@@ -227,11 +230,14 @@ def test_trained_inertia_is_the_equation_of_motion_with_another_mass() -> None:
     size = torch.tensor(scene.initial_log_stiffness).exp() * scene.gain
     place = [torch.einsum("sm,ndm->snd", x, scene.modes) for x in (z, before)]
     after = _step(scene, *place)
-    bend, force = after - 2 * z + before, size * scene.springs.between((z + before) / 2, (after + z) / 2)
+    middles = [scene.springs.stretched(middle) for middle in ((z + before) / 2, (after + z) / 2)]
+    bend, force = after - 2 * z + before, size * scene.springs.between(*middles)
     lost = (z + bend / 4) @ stiffness + (z - before + bend / 2) @ damping
     torch.testing.assert_close(bend @ mass, force - lost, rtol=1e-4, atol=1e-6 * float(lost.abs().max()))
     step, middle = (z - before)[0], (z + before)[0] / 2
-    energy = (step @ mass @ step + middle @ stiffness @ middle) / 2 + size * scene.springs.potential(middle[None])[0]
+    energy = (step @ mass @ step + middle @ stiffness @ middle) / 2 + size * scene.springs.potential(
+        scene.springs.stretched(middle[None])
+    )[0]
     assert float(_energy(scene, *place)) == pytest.approx(float(energy), rel=1e-4)
 
 

@@ -90,6 +90,10 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
     torch.testing.assert_close(slow.inertia, fast.inertia)
 
 
+def _pull(springs, z, factor=1.0, strain=None):
+    return springs.between(*[springs.stretched(z, strain)] * 2, factor)
+
+
 @pytest.fixture
 def neural():
     return lambda **options: make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
@@ -112,10 +116,10 @@ def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_o
 
     z.requires_grad_()
     expected = energy(z)
-    torch.testing.assert_close(links.potential(z, part.matrices.links), expected)
+    torch.testing.assert_close(links.potential(links.stretched(z), part.matrices.links), expected)
     (slope,) = torch.autograd.grad(expected.sum(), z)
-    torch.testing.assert_close(links.between(z, z, part.matrices.links), -slope)
-    small, large = (links.between(size * z, size * z).norm() for size in (1e-4, 1e-3))
+    torch.testing.assert_close(_pull(links, z, part.matrices.links), -slope)
+    small, large = (_pull(links, size * z).norm() for size in (1e-4, 1e-3))
     assert float((small / large).detach()) == pytest.approx(0.01, rel=0.1)
 
 
@@ -153,17 +157,18 @@ def test_the_step_solves_its_equation_with_the_slope_of_the_force(neural) -> Non
     springs, matrices = model.template.body(0).springs, part.matrices
 
     def slope(factor):
-        at = torch.autograd.functional.jacobian(lambda q: springs.between(q[None], q[None], factor)[0], z[0])
+        at = torch.autograd.functional.jacobian(lambda q: _pull(springs, q[None], factor)[0], z[0])
         return -at.detach()
 
     z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    least = torch.linalg.eigvalsh(springs.stiffening(z, matrices.links)[0] - slope(matrices.links))
+    least = torch.linalg.eigvalsh(springs.stiffening(springs.stretched(z), matrices.links)[0] - slope(matrices.links))
     assert least.min() > -1e-9 * least.max() and least.max() > 0  # compressed springs count as of their length
     taut = (z @ springs.modes.mT).unflatten(-1, (-1, 3)) + springs.offset
     only = (taut.norm(dim=-1)[0] > springs.length).double() * matrices.links
-    torch.testing.assert_close(springs.stiffening(z, only)[0], slope(only))
+    torch.testing.assert_close(springs.stiffening(springs.stretched(z), only)[0], slope(only))
     after = part.after(z, previous)
-    bend, force = after - 2 * z + previous, springs.between((z + previous) / 2, (after + z) / 2, matrices.links)
+    ends = [springs.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
+    bend, force = after - 2 * z + previous, springs.between(*ends, matrices.links)
     lost = (z + bend / 4) @ matrices.stiffness + (z - previous + bend / 2) @ matrices.damping
     torch.testing.assert_close(
         bend @ matrices.inertia, force - lost, rtol=1e-3, atol=1e-3 * float(lost.detach().abs().max())
@@ -186,19 +191,17 @@ def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
         return torch.stack([0.5 * (factor * springs.stiffness * x).sum() for x in both])
 
     whole, linear = (torch.autograd.grad(energy(z)[i], z)[0] for i in range(2))
-    torch.testing.assert_close(
-        springs.between(z.detach()[None], z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5
-    )
+    torch.testing.assert_close(_pull(springs, z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5)
     nothing = torch.zeros_like(z)
     (pulled,) = torch.autograd.grad(energy(nothing.requires_grad_())[1], nothing)
     torch.testing.assert_close(springs.pull(slope, factor)[0], -pulled, atol=1e-7, rtol=1e-5)
     turn = quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
     turned = (turn - torch.eye(3)).flatten().expand(1, count, 9)
     still = nothing.detach()[None]
-    both = springs.between(still, still, factor, turned) + springs.pull(turned, factor)
+    both = _pull(springs, still, factor, turned) + springs.pull(turned, factor)
     assert float(both.norm()) < 1e-5 * float(springs.pull(turned, factor).norm())  # a rotation strains nothing
     stretched = 0.1 * torch.eye(3, dtype=torch.float64).flatten().expand(1, count, 9)
-    stiffer = springs.stiffening(still, factor, stretched)[0]
+    stiffer = springs.stiffening(springs.stretched(still, stretched), factor)[0]
     assert torch.linalg.eigvalsh(stiffer)[0] > 0  # what is taut resists more in every direction
 
 

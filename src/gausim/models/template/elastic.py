@@ -155,7 +155,7 @@ class PreparedElastic(ModalScene):
         step, middle = z - previous, (z + previous) / 2
         heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT
         energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
-        return energy + self.factor.detach() * self.springs.potential(middle)
+        return energy + self.factor.detach() * self.springs.potential(self.springs.stretched(middle))
 
 
 class ElasticTemplate(Template):

@@ -367,4 +367,4 @@ class PreparedMaterial(ModalScene):
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.springs.potential(middle, self.factor.detach())
+        return energy + self.springs.potential(self.springs.stretched(middle), self.factor.detach())

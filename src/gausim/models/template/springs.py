@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -19,6 +21,15 @@ def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
     pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
     pairs = np.unique(np.sort(pairs, 1), axis=0)
     return pairs[pairs[:, 0] != pairs[:, 1]]
+
+
+class Stretched(NamedTuple):
+    """Springs in a state."""
+
+    change: Float[Tensor, "S E 3"]  # d - d_0 [scene units]
+    length: Float[Tensor, "S E"]  # |d|
+    stretch: Float[Tensor, "S E"]  # |d| - |d_0|, without the cancellation of a difference
+    along: Float[Tensor, "S E"]  # d_0 . (d - d_0)
 
 
 class Springs(nn.Module):
@@ -50,11 +61,6 @@ class Springs(nn.Module):
             self.register_buffer(name, torch.from_numpy(array).float(), persistent=False)
         self.register_buffer("ends", torch.from_numpy(np.ascontiguousarray(ends)), persistent=False)
 
-    def change(self, z: Float[Tensor, "S M"], strain: Float[Tensor, "S N 9"] | None = None) -> Float[Tensor, "S E 3"]:
-        """Change of every spring by the modes and by the strain of the reference at the units."""
-        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
-        return change if strain is None else change + self.strained(strain)
-
     def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S E 3"]:
         """S d_0 of every spring, S the mean of both ends."""
         both = strain.index_select(1, self.ends.flatten()).unflatten(1, (2, -1)).mean(1)
@@ -65,57 +71,45 @@ class Springs(nn.Module):
         along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
         return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
 
-    def stiffening(
-        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0, strain: Float[Tensor, "S N 9"] | None = None
-    ) -> Float[Tensor, "S M M"]:
-        """The change of the stiffness from rest to ``z``.
+    def stretched(self, z: Float[Tensor, "S M"], strain: Float[Tensor, "S N 9"] | None = None) -> Stretched:
+        """Every spring in a state of the modes, and of the reference's strain at the units."""
+        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+        change = change if strain is None else change + self.strained(strain)
+        squared, along = self.length.square(), (self.offset * change).sum(-1)
+        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
+        length = (squared + grown).clamp_min(1e-6 * squared).sqrt()
+        return Stretched(change, length, grown / (length + self.length), along)
+
+    def stiffening(self, state: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, "S M M"]:
+        """The change of the stiffness from rest to a state.
 
         The stiffness is the second derivative of the energy: (1 - t) n n^T + t I with t = 1 - |d_0| / |d| for a spring
         of length |d| and direction n (at rest n n^T). Compressed springs (t < 0) buckle; for them t is set to 0, so
-        that the stiffness at ``z`` is positive semi-definite.
+        that the stiffness is positive semi-definite.
         """
-        change, _, _, now, stretch = self._stretched(self.change(z, strain))
-        towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
-        t = (stretch / now).clamp_min(0)[..., None, None]
+        towards, rest = (state.change + self.offset) / state.length[..., None], self.offset / self.length[:, None]
+        t = (state.stretch / state.length).clamp_min(0)[..., None, None]
         blocks = (1 - t) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
-        blocks = blocks + t * torch.eye(3, dtype=z.dtype, device=z.device)
-        modes = self.modes.unflatten(0, (-1, 3))
-        turned = ((factor * self.stiffness)[:, None, None] * blocks) @ modes
+        blocks = blocks + t * torch.eye(3, dtype=t.dtype, device=t.device)
+        turned = ((factor * self.stiffness)[:, None, None] * blocks) @ self.modes.unflatten(0, (-1, 3))
         return self.modes.mT @ turned.flatten(-3, -2)
 
-    def between(
-        self,
-        first: Float[Tensor, "S M"],
-        second: Float[Tensor, "S M"],
-        factor: Tensor | float = 1.0,
-        strain: Float[Tensor, "S N 9"] | None = None,
-    ) -> Float[Tensor, "S M"]:
+    def between(self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
         """Mean nonlinear force from one state to another, whose work is exactly the loss of :meth:`potential`.
 
         A spring pulls along the mean of both d as one of the mean of both lengths does (Simo and Tarnow 1992).
+        ``factor`` is on the stiffness, one number or one per spring (E,).
         """
-        both = (self._stretched(self.change(z, strain)) for z in (first, second))
-        return self._force(tuple((a + b) / 2 for a, b in zip(*both, strict=True)), factor)
-
-    def _force(self, stretched: tuple[Tensor, ...], factor: Tensor | float) -> Tensor:
-        change, squared, along, now, stretch = stretched
-        shrink = stretch / now
-        nonlinear = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
+        change, along = (first.change + second.change) / 2, (first.along + second.along) / 2
+        shrink = (first.stretch + second.stretch) / (first.length + second.length)
+        nonlinear = shrink[..., None] * change + (shrink - along / self.length.square())[..., None] * self.offset
         nonlinear = (factor * self.stiffness)[:, None] * nonlinear
         return -(nonlinear.flatten(-2) @ self.modes)
 
-    def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
+    def potential(self, state: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
         """Potential energy of the nonlinear force."""
-        _, squared, along, _, stretch = self._stretched(self.change(z))
-        return 0.5 * (factor * self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
-
-    def _stretched(self, change: Float[Tensor, "S E 3"]) -> tuple[Tensor, ...]:
-        """D - d_0, |d_0|^2, d_0 . (d - d_0), |d| and |d| - |d_0| of every spring."""
-        squared = self.length.square()
-        along = (self.offset * change).sum(-1)
-        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
-        now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
-        return change, squared, along, now, grown / (now + self.length)  # avoids the cancellation of |d| - |d_0|
+        linear = state.along.square() / self.length.square()
+        return 0.5 * (factor * self.stiffness * (state.stretch.square() - linear)).sum(-1)
 
 
 def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:

@@ -195,13 +195,14 @@ class ModalScene(ABC):
         strain, own = (None, 0.0) if load is None else (load[..., 3:], self.force(load))
         inertia, stiffness, damping = self.inertia, self.stiffness, self.damping
         with torch.no_grad():
-            stiffer = self.springs.stiffening(z, self.factor, strain)
-            operator = torch.linalg.lu_factor(inertia + (stiffness + stiffer) / 4 + damping / 2)
+            stiffer = self.springs.stiffening(self.springs.stretched(z, strain), self.factor)
+            inverse = torch.linalg.inv(inertia + (stiffness + stiffer) / 4 + damping / 2)
         speed, bend = z - previous, torch.zeros_like(z)
+        first = self.springs.stretched(z - speed / 2, strain)
         for _ in range(CORRECTIONS):
-            nonlinear = self.springs.between(z - speed / 2, z + (speed + bend) / 2, self.factor, strain)
+            nonlinear = self.springs.between(first, self.springs.stretched(z + (speed + bend) / 2, strain), self.factor)
             force = nonlinear - (z + bend / 4) @ stiffness.mT - (speed + bend / 2) @ damping.mT + own
-            bend = bend + torch.linalg.lu_solve(*operator, (force - bend @ inertia.mT)[..., None])[..., 0]
+            bend = bend + (inverse @ (force - bend @ inertia.mT)[..., None])[..., 0]
         return z + speed + bend
 
     @abstractmethod
