@@ -75,11 +75,14 @@ def test_energy_is_kept_without_damping_and_lost_with_it_for_random_mixing(elast
     if not damped:
         _undamped(elastic)
     before, now = torch.randn(2, 1, 9, generator=generator, dtype=torch.float64)
-    prepared, energies = PreparedElastic(elastic), []
+    prepared, energies, taken = PreparedElastic(elastic), [], []
     for _ in range(1000):
         energies.append(float(prepared.energy(now, before)))
-        before, now = now, prepared.after(now, before)
-    energy = torch.tensor(energies, dtype=torch.float64)
+        after = prepared.after(now, before)
+        taken.append(float(prepared.dissipated(after, before)))
+        before, now = now, after
+    energy, lost = (torch.tensor(x, dtype=torch.float64) for x in (energies, taken))
+    torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-6, atol=1e-9 * energies[0])
     assert bool((energy.diff() <= 1e-9 * energy[0]).all())
     if damped:
         assert float(energy[-1]) < 0.5 * float(energy[0])

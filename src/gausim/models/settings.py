@@ -76,8 +76,9 @@ class RolloutSettings:
 
     Attributes:
         cuda_graph: on a CUDA device the step is replayed as one graph; no effect on other devices.
-        energy_guard_frames: number of past frames whose largest energy (in the template's terms) the network may not
-            exceed (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template without energy: no limit.
+        energy_guard_frames: number of past frames, of whose largest energy (in the template's terms) the network may
+            not exceed what damping leaves (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template
+            without energy: no limit.
     """
 
     cuda_graph: bool = False

@@ -20,11 +20,12 @@ BISECTIONS = 10
 
 
 class EnergyGuard:
-    """Keeps the energy E of a rollout, in the template's terms, below its maximum over the last frames.
+    """Keeps the energy E of a rollout, in the template's terms, below what damping leaves of that of the last frames.
 
-    Within that window the network may return energy it removed, exchange energy between modes, or compensate damping;
-    the maximum of E over ``energy_guard_frames`` frames cannot grow. Motion without forces therefore stays bounded over
-    any number of frames. A step that would exceed the limit is repeated with the correction scale
+    Since some frame of the last ``energy_guard_frames`` the network must not have done work: E_t is at most the largest
+    of E_i minus what the template's damping has taken since frame i. Within that window the network may return energy
+    that it removed, or exchange it between modes; motion without forces dies away as the damping says. A step that
+    would exceed the limit is repeated with the correction scale
 
         s = (limit - E_0) / (E_1 - E_0)
 
@@ -75,6 +76,8 @@ class EnergyGuard:
                 result, energy = self._weakened(state, force, self._ceiling)
             if energy > self._ceiling:
                 result, energy = self._cut_short(result, state, self._ceiling)
+        lost = float(self._model.dissipated(self._prepared, SimState(result.positions, state.previous)))
+        self._last = deque((before - lost for before in self._last), self._last.maxlen)
         self._last.append(energy)
         self._made = SteppedFrame(result.positions, result.deformation_gradients, result.rotations)
         return result

@@ -178,8 +178,11 @@ class SceneModel(nn.Module, ABC):
             NotImplementedError: the template has none.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
-        now, before = prepared.finest(state.positions), prepared.finest(state.previous)
-        return prepared.template.energy(Motion(prepared.levels[-1].rest, now, before))
+        return prepared.template.energy(_finest(prepared, state))
+
+    def dissipated(self, prepared: Prepared, ends: SimState) -> Float[Tensor, " S"]:
+        """Energy that the template's damping takes in a step; ``ends`` are the positions at t + 1 and t - 1."""
+        return prepared.template.dissipated(_finest(prepared, ends))
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """Mode mixing of the template of a scene (:meth:`Template.mixing`); None where it has none."""
@@ -246,3 +249,8 @@ class SceneModel(nn.Module, ABC):
             module.requires_grad_(False)
         for normaliser in normalisers_of(self.predictor):
             normaliser.frozen = True
+
+
+def _finest(prepared: Prepared, state: SimState) -> Motion:
+    now, before = prepared.finest(state.positions), prepared.finest(state.previous)
+    return Motion(prepared.levels[-1].rest, now, before)

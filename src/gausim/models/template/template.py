@@ -90,6 +90,14 @@ class PreparedTemplate:
         """
         raise NotImplementedError("the rest state has no energy")
 
+    def dissipated(self, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy that the damping takes from every member in a step; ``motion`` is at t + 1 and t - 1.
+
+        Raises:
+            NotImplementedError: the template has no energy.
+        """
+        raise NotImplementedError("the rest state has no energy")
+
     def correction_unit(self) -> Float[Tensor, " S"] | None:
         """Factor on the network's output of every member of the batch; None for a factor of 1."""
         return None
@@ -209,6 +217,11 @@ class ModalScene(ABC):
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """Energy of v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2; only the state receives loss gradients."""
 
+    def dissipated(self, after: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """Energy lost to damping in a step, v^T D v of v = (z_{t+1} - z_{t-1}) / 2."""
+        speed = (after - previous) / 2
+        return ((speed @ self.damping) * speed).sum(-1)
+
 
 def force_of_strain(
     strain: Float[Tensor, "S N 9"], uneven: Float[Tensor, "N 2"], modes: Float[Tensor, "N 9 M"]
@@ -277,8 +290,16 @@ class PreparedScenes(PreparedTemplate):
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
+        return self._of_members(motion, lambda part: part.energy)
+
+    def dissipated(self, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy that the damping takes from every member in a step; ``motion`` is at t + 1 and t - 1."""
+        return self._of_members(motion, lambda part: part.dissipated)
+
+    def _of_members(self, motion: Motion, figure: Callable[[ModalScene], Callable[..., Tensor]]) -> Float[Tensor, " S"]:
         found = [
-            p.energy(*p.coordinates(*self._displacements(motion, rows, members))) for p, rows, members in self.parts
+            figure(part)(*part.coordinates(*self._displacements(motion, rows, members)))
+            for part, rows, members in self.parts
         ]
         return self._by_member(found, motion.rest)
 
