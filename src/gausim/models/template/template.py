@@ -204,7 +204,8 @@ class ModalScene(ABC):
         inertia, stiffness, damping = self.inertia, self.stiffness, self.damping
         with torch.no_grad():
             stiffer = self.springs.stiffening(self.springs.stretched(z, strain), self.factor)
-            inverse = torch.linalg.inv(inertia + (stiffness + stiffer) / 4 + damping / 2)
+            operator = inertia + (stiffness + stiffer) / 4 + damping / 2
+            inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
         speed, bend = z - previous, torch.zeros_like(z)
         first = self.springs.stretched(z - speed / 2, strain)
         for _ in range(CORRECTIONS):
