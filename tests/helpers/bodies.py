@@ -12,6 +12,7 @@ from torch import Tensor
 from gausim.core import GaussianScene, SimState
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.springs import Springs
 from helpers.simulators import gausim
 
 # The settings of `model=gausim`, small.
@@ -71,3 +72,9 @@ def join_states(states: Sequence[SimState]) -> SimState:
 def permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
     names = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
     return replace(scene, **{n: getattr(scene, n)[order] for n in names})
+
+
+def pull_of(springs: Springs, z: Tensor, factor: Tensor | float = 1.0, strain: Tensor | None = None) -> Tensor:
+    """Nonlinear force (S, M) of springs that stay in the state z (S, M)."""
+    taut = None if strain is None else springs.strained(strain)
+    return springs.between(*[springs.stretched(z, taut)] * 2, factor)

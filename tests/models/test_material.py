@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from helpers.bodies import NEURAL, make_model, make_scene, make_state
+from helpers.bodies import NEURAL, make_model, make_scene, make_state, pull_of
 from helpers.simulators import silence
 
 from gausim.core import SimState
@@ -90,10 +90,6 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
     torch.testing.assert_close(slow.inertia, fast.inertia)
 
 
-def _pull(springs, z, factor=1.0, strain=None):
-    return springs.between(*[springs.stretched(z, strain)] * 2, factor)
-
-
 @pytest.fixture
 def neural():
     return lambda **options: make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
@@ -118,8 +114,8 @@ def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_o
     expected = energy(z)
     torch.testing.assert_close(links.potential(links.stretched(z), part.matrices.links), expected)
     (slope,) = torch.autograd.grad(expected.sum(), z)
-    torch.testing.assert_close(_pull(links, z, part.matrices.links), -slope)
-    small, large = (_pull(links, size * z).norm() for size in (1e-4, 1e-3))
+    torch.testing.assert_close(pull_of(links, z, part.matrices.links), -slope)
+    small, large = (pull_of(links, size * z).norm() for size in (1e-4, 1e-3))
     assert float((small / large).detach()) == pytest.approx(0.01, rel=0.1)
 
 
@@ -157,7 +153,7 @@ def test_the_step_solves_its_equation_with_the_slope_of_the_force(neural) -> Non
     springs, matrices = model.template.body(0).springs, part.matrices
 
     def slope(factor):
-        at = torch.autograd.functional.jacobian(lambda q: _pull(springs, q[None], factor)[0], z[0])
+        at = torch.autograd.functional.jacobian(lambda q: pull_of(springs, q[None], factor)[0], z[0])
         return -at.detach()
 
     z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -191,17 +187,19 @@ def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
         return torch.stack([0.5 * (factor * springs.stiffness * x).sum() for x in both])
 
     whole, linear = (torch.autograd.grad(energy(z)[i], z)[0] for i in range(2))
-    torch.testing.assert_close(_pull(springs, z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5)
+    torch.testing.assert_close(
+        pull_of(springs, z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5
+    )
     nothing = torch.zeros_like(z)
     (pulled,) = torch.autograd.grad(energy(nothing.requires_grad_())[1], nothing)
     torch.testing.assert_close(springs.pull(slope, factor)[0], -pulled, atol=1e-7, rtol=1e-5)
     turn = quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
     turned = (turn - torch.eye(3)).flatten().expand(1, count, 9)
     still = nothing.detach()[None]
-    both = _pull(springs, still, factor, turned) + springs.pull(turned, factor)
+    both = pull_of(springs, still, factor, turned) + springs.pull(turned, factor)
     assert float(both.norm()) < 1e-5 * float(springs.pull(turned, factor).norm())  # a rotation strains nothing
     stretched = 0.1 * torch.eye(3, dtype=torch.float64).flatten().expand(1, count, 9)
-    stiffer = springs.stiffening(springs.stretched(still, stretched), factor)[0]
+    stiffer = springs.stiffening(springs.stretched(still, springs.strained(stretched)), factor)[0]
     assert torch.linalg.eigvalsh(stiffer)[0] > 0  # what is taut resists more in every direction
 
 
@@ -312,6 +310,7 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural
         step = model.step(batch, state, prepared=prepared)
         state = SimState(step.positions, state.positions)
     assert max(energies) < 1.001 * energies[0] and energies[-1] < 0.5 * energies[0]
+    assert float((state.positions - scene.means).norm()) < 0.5 * float((moved - scene.means).norm())
 
 
 def test_the_material_of_the_units_is_told_as_it_enters_the_matrices(hierarchy) -> None:

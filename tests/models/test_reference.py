@@ -10,7 +10,7 @@ from helpers.bodies import NEURAL, make_model
 
 from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
 from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
-from gausim.models.reference.floor import COMPLIANCE, Contact, _projected_gradients, _solved
+from gausim.models.reference.floor import COMPLIANCE, Contact, _projected_gradients, _softer, _solved
 from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.predictor import with_floor_columns
@@ -200,8 +200,7 @@ def test_loss_gradients_of_many_near_contacts_tell_of_their_sum_only() -> None:
     corners = torch.cat((corners[:, :2] - corners[:, :2].mean(0), torch.zeros(10, 1).double()), 1)
     rows = torch.cat((torch.eye(3).double().expand(10, 3, 3), -cross_matrix(corners)), -1)
     body = rows[:, [2, 0, 1]].flatten(0, 1)  # a rigid plate: along the normal and two tangents, by six coordinates
-    spread = body @ body.mT
-    spread = spread + COMPLIANCE * spread.diagonal().mean() * torch.eye(30).double()
+    spread = _softer(body @ body.mT, COMPLIANCE)
     contact = Contact(FLOOR, torch.tensor(5.0).double(), torch.tensor(0.0).double(), 1.0)
     wanted, guess, pressing = -body[:, 2], torch.zeros(30).double(), torch.ones(10, dtype=torch.bool)
     for _ in range(20):

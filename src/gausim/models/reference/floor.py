@@ -176,8 +176,7 @@ class Contact:
         jacobian = coordinates.jacobian(points, placed.positions, axes)
         inertia, stiffness, damping = coordinates.inertia, coordinates.stiffness, coordinates.damping
         response = torch.linalg.inv(inertia + h**2 / 4 * stiffness + h / 2 * damping)
-        spread = jacobian @ response @ jacobian.mT
-        spread = spread + COMPLIANCE * spread.diagonal().mean() * torch.eye(len(spread)).to(spread)
+        spread = _softer(jacobian @ response @ jacobian.mT, COMPLIANCE)
         start, end = (
             (x[points] - x.new_tensor(self.floor.point)) @ axes.mT for x in (state.positions, placed.positions)
         )
@@ -220,7 +219,7 @@ class Contact:
             direction = (found[:, 1:] / size.clamp_min(1e-30)[:, None]).to(wanted)
         if not torch.is_grad_enabled():
             return solved.to(wanted), solved
-        softer = spread + GRADIENT_COMPLIANCE * spread.diagonal().mean() * torch.eye(len(spread)).to(spread)
+        softer = _softer(spread, GRADIENT_COMPLIANCE)
         equal = _solved(softer, wanted, pressing, sliding, direction * self.friction)
         return solved.to(wanted) + (equal - equal.detach()), solved
 
@@ -234,6 +233,10 @@ def _lowest(gap: Float[Tensor, " K"], body: Elasticity, near: float) -> Int[Tens
     first = torch.ones_like(unit, dtype=torch.bool)
     first[1:] = unit[sort][1:] != unit[sort][:-1]
     return order[sort[first]]
+
+
+def _softer(spread: Float[Tensor, "D D"], compliance: float) -> Float[Tensor, "D D"]:
+    return spread + compliance * spread.diagonal().mean() * torch.eye(len(spread)).to(spread)
 
 
 def _axes(normal: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:

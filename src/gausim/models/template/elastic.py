@@ -149,14 +149,6 @@ class PreparedElastic(ModalScene):
         own = super().force(load) + (density * acceleration).flatten(1) @ self.projection
         return own + force_of_strain(strain, scale * uneven, self.scene.strains)
 
-    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """|H v|^2 / 2 + (H m)^T K H m / 2 + the springs' nonlinear part; conserved without damping."""
-        root, mixing = (x.detach() for x in self.scene.roots())
-        step, middle = z - previous, (z + previous) / 2
-        heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT
-        energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
-        return energy + self.factor.detach() * self.springs.potential(self.springs.stretched(middle))
-
 
 class ElasticTemplate(Template):
     """Template with learned elastodynamics, one set of matrices per scene."""

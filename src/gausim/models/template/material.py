@@ -18,9 +18,9 @@ a_j1 to p and g. These factors give, in modal coordinates z,
 k, c_0 and c_1 are trained numbers common to all scenes. The links of stiffness e^{g_ij} are springs with geometric
 nonlinearity. A frame is the step that all modal templates have in common
 (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
-that a step never creates energy, and without damping it conserves energy. It does not amplify
-vibrations too fast for the frame rate. The decoders' only geometric input are distances, so that they generalise to
-other bodies and orientations.
+that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for
+the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
+orientations.
 """
 
 from __future__ import annotations
@@ -361,10 +361,3 @@ class PreparedMaterial(ModalScene):
         """
         z = displacement.flatten(1) @ self.projection
         return (z @ self.positions.mT).view_as(displacement)
-
-    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 + the links' nonlinear part; conserved without damping."""
-        step, middle = z - previous, (z + previous) / 2
-        inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
-        energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.springs.potential(self.springs.stretched(middle), self.factor.detach())

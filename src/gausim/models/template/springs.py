@@ -71,10 +71,10 @@ class Springs(nn.Module):
         along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
         return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
 
-    def stretched(self, z: Float[Tensor, "S M"], strain: Float[Tensor, "S N 9"] | None = None) -> Stretched:
-        """Every spring in a state of the modes, and of the reference's strain at the units."""
+    def stretched(self, z: Float[Tensor, "S M"], taut: Float[Tensor, "S E 3"] | None = None) -> Stretched:
+        """Every spring in a state of the modes; ``taut`` is what the reference's strain changes (:meth:`strained`)."""
         change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
-        change = change if strain is None else change + self.strained(strain)
+        change = change if taut is None else change + taut
         squared, along = self.length.square(), (self.offset * change).sum(-1)
         grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
         length = (squared + grown).clamp_min(1e-6 * squared).sqrt()

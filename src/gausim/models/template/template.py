@@ -144,7 +144,7 @@ class Template(nn.Module, ABC):
         return None
 
 
-class ModalScene(ABC):
+class ModalScene:
     """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
     inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
@@ -200,23 +200,30 @@ class ModalScene(ABC):
         Without damping and load it conserves :meth:`energy` exactly. It is solved by corrections with the stiffness at
         z_t; loss gradients are those of the corrections.
         """
-        strain, own = (None, 0.0) if load is None else (load[..., 3:], self.force(load))
-        inertia, stiffness, damping = self.inertia, self.stiffness, self.damping
-        with torch.no_grad():
-            stiffer = self.springs.stiffening(self.springs.stretched(z, strain), self.factor)
-            operator = inertia + (stiffness + stiffer) / 4 + damping / 2
-            inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
+        springs, factor = self.springs, self.factor
         speed, bend = z - previous, torch.zeros_like(z)
-        first = self.springs.stretched(z - speed / 2, strain)
+        taut, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
+        if load is not None:
+            taut, force = springs.strained(load[..., 3:]), force + self.force(load)
+        linear = self.inertia + self.stiffness / 4 + self.damping / 2
+        with torch.no_grad():
+            operator = linear + springs.stiffening(springs.stretched(z, taut), factor) / 4
+            inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
+        first = springs.stretched(z - speed / 2, taut)
         for _ in range(CORRECTIONS):
-            nonlinear = self.springs.between(first, self.springs.stretched(z + (speed + bend) / 2, strain), self.factor)
-            force = nonlinear - (z + bend / 4) @ stiffness.mT - (speed + bend / 2) @ damping.mT + own
-            bend = bend + (inverse @ (force - bend @ inertia.mT)[..., None])[..., 0]
+            nonlinear = springs.between(first, springs.stretched(z + (speed + bend) / 2, taut), factor)
+            bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
         return z + speed + bend
 
-    @abstractmethod
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """Energy of v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2; only the state receives loss gradients."""
+        """v^T M v / 2 + m^T K m / 2 + the springs' nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
+
+        Only the state receives loss gradients.
+        """
+        step, middle = z - previous, (z + previous) / 2
+        inertia, stiffness, factor = self.inertia.detach(), self.stiffness.detach(), self.factor.detach()
+        energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
+        return energy + self.springs.potential(self.springs.stretched(middle), factor)
 
     def dissipated(self, after: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """Energy lost to damping in a step, v^T D v of v = (z_{t+1} - z_{t-1}) / 2."""
@@ -291,15 +298,17 @@ class PreparedScenes(PreparedTemplate):
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
-        return self._of_members(motion, lambda part: part.energy)
+        return self._of_members(motion, ModalScene.energy)
 
     def dissipated(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy that the damping takes from every member in a step; ``motion`` is at t + 1 and t - 1."""
-        return self._of_members(motion, lambda part: part.dissipated)
+        return self._of_members(motion, ModalScene.dissipated)
 
-    def _of_members(self, motion: Motion, figure: Callable[[ModalScene], Callable[..., Tensor]]) -> Float[Tensor, " S"]:
+    def _of_members(
+        self, motion: Motion, figure: Callable[[ModalScene, Tensor, Tensor], Tensor]
+    ) -> Float[Tensor, " S"]:
         found = [
-            figure(part)(*part.coordinates(*self._displacements(motion, rows, members)))
+            figure(part, *part.coordinates(*self._displacements(motion, rows, members)))
             for part, rows, members in self.parts
         ]
         return self._by_member(found, motion.rest)
