@@ -42,7 +42,7 @@ class Sway(nn.Module):
         members, start = [], 0
         for n, i in enumerate(scene_ids):
             count = self.scenes[i].count
-            units = torch.zeros(count, dtype=torch.long)
+            units = torch.zeros(count, dtype=torch.long, device=self.scenes[i].means.device)
             rows = slice(start, start + count)
             members.append(SimpleNamespace(scene_id=i, kernels=rows, units=slice(n, n + 1), unit_of_kernel=units))
             start += count
@@ -60,7 +60,7 @@ class Sway(nn.Module):
         positions = state.positions + self.keep * (state.positions - state.previous) + push
         if self.poison is not None:
             positions = positions * self.poison
-        identity = torch.eye(3).expand(len(batch.members), 3, 3)
+        identity = torch.eye(3, device=positions.device).expand(len(batch.members), 3, 3)
         momentum = (self.keep * drift.mean()).square()
         return SimpleNamespace(
             positions=positions, deformation_gradients=identity, rotations=identity, momentum=momentum
@@ -71,11 +71,11 @@ class Previous(nn.Module):
     def __init__(self, model: Sway, scene_of_sequence: tuple[int, ...]) -> None:
         super().__init__()
         self.values = nn.ParameterList(model.scenes[i].means.clone() for i in scene_of_sequence)
-
-        self.rest = [model.scenes[i].means for i in scene_of_sequence]
+        for sequence_id, scene_id in enumerate(scene_of_sequence):
+            self.register_buffer(f"rest_{sequence_id}", model.scenes[scene_id].means, persistent=False)
 
     def state(self, sequence_id: int) -> SimState:
-        return SimState(self.rest[sequence_id], self.values[sequence_id])
+        return SimState(self.get_buffer(f"rest_{sequence_id}"), self.values[sequence_id])
 
 
 SCENE_OF_SEQUENCE = (0, 0, 1)

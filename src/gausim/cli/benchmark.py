@@ -29,7 +29,7 @@ RIVAL = "model=gausim_elastic"  # reference for the speed of training
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
-    arguments = _parser().parse_args(argv)
+    arguments = _parser().parse_intermixed_args(argv)  # KEY=VALUE may follow an option
     import torch
 
     from gausim.benchmark.harness import Options, machine, torch_threads

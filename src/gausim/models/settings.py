@@ -72,10 +72,11 @@ class HierarchySettings:
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """Settings of rollouts without loss gradients.
+    """Settings of rollouts; the energy guard is for those without loss gradients.
 
     Attributes:
-        cuda_graph: on a CUDA device the step is replayed as one graph; no effect on other devices.
+        cuda_graph: on a CUDA device steps, and in training whole rollouts with their backward pass, are replayed as one
+            graph (:class:`gausim.training.graphed.GraphedRollouts`); no effect on other devices.
         energy_guard_frames: number of past frames, of whose largest energy (in the template's terms) the network may
             not exceed what damping leaves (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template
             without energy: no limit.

@@ -19,6 +19,7 @@ from gausim.runs.checkpoint import WeightAverage
 from gausim.training.baseline_metrics import Baselines, SequenceBaseline
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
+from gausim.training.graphed import GraphedRollouts
 from gausim.training.method import Method, Task
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
@@ -51,7 +52,8 @@ class Learner(nn.Module):
         self.method, self.model, self.initial_states = method, method.model, method.initial_states
         self.objective = objective if objective is not None else Objective()
         self.settings = optimizer if optimizer is not None else OptimizerSettings()
-        self.free_motion = FreeMotion(method.model, self.objective)
+        self.graphs = GraphedRollouts(method.model)
+        self.free_motion = FreeMotion(method.model, self.objective, self.graphs)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.images.begins = self._begins

@@ -85,8 +85,10 @@ def roll_out(
     per = objective.step_weight(steps) / len(whole)
     own, last = torch.zeros(len(samples), device=device), initial
     hands = learner.hands(samples)
-    for start, made in windows(
-        learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept, hands=hands
+    for start, made in (
+        windows(learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept, hands=hands)
+        if kept or hands is not None or length < steps or learner.measuring
+        else learner.graphs.windows(batch, explosions.restart(initial), steps, length)
     ):
         states = States.of(made)
         if explosions.end(states.positions, start, statistics.reach):

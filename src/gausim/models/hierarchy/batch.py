@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -99,14 +99,20 @@ class SceneBatch:
         """Scene of each member."""
         return tuple(m.scene_id for m in self.members)
 
+    @cached_property
+    def scene_index(self) -> Int[Tensor, " S"]:
+        """``scene_ids`` on the device."""
+        return torch.tensor(self.scene_ids, device=self.rest.device)
 
-def rows_by_scene(batch: SceneBatch) -> Iterator[tuple[int, Int[Tensor, " R"], list[int]]]:
-    """Iterates over the scenes of a batch: scene index, rows of its members' finest units, and the members."""
-    spans = batch.levels[-1].spans
-    for scene_id in sorted(set(batch.scene_ids)):
-        members = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
-        rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
-        yield scene_id, rows.to(batch.rest.device), members
+    @cached_property
+    def rows_by_scene(self) -> tuple[tuple[int, Int[Tensor, " R"], list[int]], ...]:
+        """For each scene its index, the rows of its members' finest units, and the members."""
+        spans, found = self.levels[-1].spans, []
+        for scene_id in sorted(set(self.scene_ids)):
+            members = [i for i, s in enumerate(self.scene_ids) if s == scene_id]
+            rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
+            found.append((scene_id, rows.to(self.rest.device), members))
+        return tuple(found)
 
 
 class BatchBuilder:

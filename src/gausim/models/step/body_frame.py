@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -57,8 +56,7 @@ class Frames:
     @classmethod
     def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> Frames:
         """Selects the axes and origins of a batch from those of all scenes."""
-        scenes = torch.tensor(batch.scene_ids, device=axes.device)
-        rows = [scenes.index_select(0, level.member) for level in batch.levels]
+        rows = [batch.scene_index.index_select(0, level.member) for level in batch.levels]
         return cls(tuple(axes[r] for r in rows), tuple(origins[r] for r in rows))
 
     def into(self, level: int, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:

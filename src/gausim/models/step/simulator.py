@@ -71,7 +71,7 @@ class GausSim(SceneModel):
                 frames= (axes of the scenes), conserve_volume=conserve_mass).
             conserve_mass: normalise to det F = 1.
             conserve_momentum: compute the momentum loss.
-            rollout: settings of rollouts without loss gradients.
+            rollout: CUDA graphs, and the energy guard of rollouts without loss gradients.
 
         Raises:
             ConfigError: incompatible settings, or not one frame rate per scene.

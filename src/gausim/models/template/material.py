@@ -241,7 +241,7 @@ class MaterialTemplate(Template):
         return own + _saturated(units), between + _saturated(links)
 
     def matrices(
-        self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
+        self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float | Tensor
     ) -> Matrices:
         """K, M and D of one scene from the densities and attributes of its units; ``dt`` is the frame interval [s]."""
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
@@ -297,7 +297,7 @@ class MaterialTemplate(Template):
 
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
-            matrices = self.matrices(scene_id, density, attributes, float(batch.levels[-1].dt[rows[0]]))
+            matrices = self.matrices(scene_id, density, attributes, batch.levels[-1].dt.index_select(0, rows[:1])[0, 0])
             reference = math.exp(self.start[0]) if self.named_attributes else None
             return PreparedMaterial(self.body(scene_id), matrices, reference)
 

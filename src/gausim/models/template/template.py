@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.models.hierarchy.batch import SceneBatch, rows_by_scene
+from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import FIRST, SECOND
@@ -256,7 +256,7 @@ class PreparedScenes(PreparedTemplate):
         self._conserve_volume = conserve_volume
         self.parts = [
             (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
-            for scene_id, rows, members in rows_by_scene(batch)
+            for scene_id, rows, members in batch.rows_by_scene
         ]
         order = torch.cat([rows for _, rows, _ in self.parts])
         self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
@@ -311,7 +311,7 @@ class PreparedScenes(PreparedTemplate):
             figure(part, *part.coordinates(*self._displacements(motion, rows, members)))
             for part, rows, members in self.parts
         ]
-        return self._by_member(found, motion.rest)
+        return self._by_member(found)
 
     def correction_unit(self) -> Float[Tensor, " S"] | None:
         """Factor on the network's output of every member of the batch; None for a factor of 1."""
@@ -321,11 +321,14 @@ class PreparedScenes(PreparedTemplate):
             if unit is None:
                 return None
             made.append(unit.expand(len(members)))
-        return self._by_member(made, made[0])
+        return self._by_member(made)
 
-    def _by_member(self, found: list[Tensor], like: Tensor) -> Tensor:
-        order = torch.tensor([m for _, _, members in self.parts for m in members], device=like.device)
-        return torch.cat(found).index_select(0, order.argsort())
+    def _by_member(self, found: list[Tensor]) -> Tensor:
+        joined = torch.cat(found)
+        if len(self.parts) == 1:
+            return joined
+        order = [m for _, _, members in self.parts for m in members]
+        return torch.stack([joined[order.index(m)] for m in range(len(order))])  # no index that the host would send
 
 
 class RestTemplate(Template):

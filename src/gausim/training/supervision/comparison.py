@@ -141,7 +141,8 @@ class _Compare(torch.autograd.Function):
             with torch.set_grad_enabled(any(wanted)):
                 images = work.draw(chunk, States(*leaves))
             values, slope, change = work.compare(images.detach(), chunk, start)
-            losses[chunk.span, list(chunk.members)] = values.to(losses).mT
+            for own, member in zip(values.to(losses), chunk.members, strict=True):  # a list would be sent to the device
+                losses[chunk.span, member] = own
             motion += change
             if images.requires_grad:
                 _scatter(images, slope, leaves, kept, chunk, work)

@@ -14,7 +14,8 @@ from gausim.core import ConfigError, SimState
 from gausim.data.sampler import hash_seed
 from gausim.losses.objective import Objective
 from gausim.training.contracts import SceneBatch, Step
-from gausim.training.rollout import after, windows
+from gausim.training.graphed import GraphedRollouts
+from gausim.training.rollout import after
 
 # Range of the random factor on the motion that continues freely, so that all amplitudes are trained.
 SMALLEST, LARGEST = 0.2, 1.5
@@ -24,14 +25,20 @@ FREE_MOTION = 1
 
 
 def energy_growth(
-    model: Any, batch: SceneBatch, state: SimState, frames: int, stretch: int, draws: torch.Generator
+    model: Any,
+    batch: SceneBatch,
+    state: SimState,
+    frames: int,
+    stretch: int,
+    draws: torch.Generator,
+    graphs: GraphedRollouts | None = None,
 ) -> Iterator[Float[Tensor, " S"]]:
     """Continues the motion of a batch without forces and computes the growth of its energy.
 
     The energy of a vibration in the template's terms is not constant from frame to frame, so means over stretches of
     about a period are compared. The motion continues from ``state``, scaled by a random factor, for ``frames`` frames;
     loss gradients stop at the beginning of every ``stretch``. Surroundings are left out. After an explosion nothing
-    more is yielded: its loss gradients are not finite.
+    more is yielded: its loss gradients are not finite. ``graphs`` are the model's.
 
     Yields:
         max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
@@ -41,11 +48,12 @@ def energy_growth(
     state = SimState(
         *(batch.rest + size * (x - batch.rest) for x in (state.positions.detach(), state.previous.detach()))
     )
+    roll_out = GraphedRollouts(model).windows if graphs is None else graphs.windows
     with torch.no_grad():
-        ((_, made),) = windows(model, batch, state, stretch, stretch, isolated=True)
+        ((_, made),) = roll_out(batch, state, stretch, stretch, isolated=True)
         before = _mean_energy(model, batch, state, made)
     state = after(made, state)
-    for _, made in windows(model, batch, state, frames - stretch, stretch, isolated=True):
+    for _, made in roll_out(batch, state, frames - stretch, stretch, isolated=True):
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
             return  # exploded; loss gradients are not finite (the step's only read that blocks on a GPU)
@@ -67,7 +75,7 @@ class FreeMotion:
         weight: weight of the energy growth; 0 for a model without an energy.
     """
 
-    def __init__(self, model: nn.Module, objective: Objective) -> None:
+    def __init__(self, model: nn.Module, objective: Objective, graphs: GraphedRollouts | None = None) -> None:
         knows, weight = bool(getattr(model, "knows_energy", False)), objective.energy_weight
         if weight and not knows:
             name = type(getattr(model, "template", model)).__name__
@@ -76,7 +84,7 @@ class FreeMotion:
                 "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
             )
         self.weight = float(knows) if weight is None else float(weight)
-        self._model, self._objective = model, objective
+        self._model, self._objective, self._graphs = model, objective, graphs
 
     def chosen(self, draws: torch.Generator) -> torch.Generator | None:
         """Draws whether this batch has the term; returns its random generator, or None."""
@@ -100,7 +108,7 @@ class FreeMotion:
         """
         frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
         total = losses.new_zeros(())
-        for growth in energy_growth(self._model, batch, state, frames, stretch, draws):
+        for growth in energy_growth(self._model, batch, state, frames, stretch, draws, self._graphs):
             if growth.requires_grad:
                 backward(self.weight * (losses * growth).sum())
             total += growth.detach().sum() / count

@@ -1,0 +1,101 @@
+"""Rollouts of optimiser steps as CUDA graphs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from helpers.meta_device import asking_nothing
+from helpers.sway import ELASTIC, blobs, real_module, sample
+from torch import Tensor, nn
+
+from gausim.losses.objective import Objective
+from gausim.models.settings import RolloutSettings
+from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.template import RestTemplate
+from gausim.training.graphed import GraphedRollouts, _Stretch
+from gausim.training.module import GausSimModule
+
+# Every batch has free motion, where a template knows its energy.
+OBJECTIVE = Objective(
+    static_weight=0.0, backprop_steps=0, energy_weight=None, energy_probability=1.0, energy_frames=6, energy_stretch=2
+)
+MATERIAL = partial(MaterialTemplate, modes=6)
+TEMPLATES = pytest.mark.parametrize("template", [RestTemplate, ELASTIC, MATERIAL])
+
+
+def module_on(device: str, **options: Any) -> GausSimModule:
+    module = real_module(parts={"objective": OBJECTIVE, "fraction_every": 0}, **options).to(device)
+    module.images.renderer = blobs
+    return module
+
+
+def optimised(module: GausSimModule, updates: int = 1) -> tuple[list[dict[str, float]], dict[str, Tensor]]:
+    """Metrics of every update, and the loss gradients of the last one."""
+    device = next(module.parameters()).device
+    samples, optimizer = [sample(0).to(device), sample(0).to(device)], module.configure_optimizers()
+    metrics = [module.optimise(samples, optimizer, torch.Generator().manual_seed(n)) for n in range(updates)]
+    return metrics, {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+
+
+def test_a_rollout_from_tensors_to_tensors_has_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but the capture, which needs a device."""
+    expected, gradients = optimised(module_on("cpu", template=ELASTIC), 3)
+    captures: list[int] = []
+
+    def captured(stretch: nn.Module, given: Any, **options: Any) -> Any:
+        captures.append(len(given))
+        returned = [stretch(*given)]  # as a capture does: its rollouts must leave no trace in the input statistics
+
+        def replay(*own: Tensor) -> tuple[Tensor, ...]:
+            made = stretch(*own)
+            for earlier, new in zip(returned[-1], made, strict=True):
+                earlier.data.copy_(new)  # as a replay does: what it returned before is overwritten
+            returned.append(made)
+            return made
+
+        return replay
+
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", captured)
+    monkeypatch.setattr(GraphedRollouts, "serves", True)
+    found, own = optimised(module_on("cpu", template=ELASTIC), 3)
+    assert captures == [2, 2]  # once for three updates, and once for their free motion
+    assert found == expected
+    for name, gradient in own.items():  # what is not used has zeros instead of none
+        assert torch.equal(gradient, gradients.get(name, torch.zeros_like(gradient)))
+
+
+@TEMPLATES
+def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(monkeypatch: pytest.MonkeyPatch, template: Any) -> None:
+    """Preparation included, for a graph captures all three."""
+    model = module_on("cpu", template=template, edges="rest").simulator.to("meta")
+    batch = model.batch((0, 0))
+    stretch, given = _Stretch(model, batch, 2), [torch.empty_like(batch.rest).requires_grad_() for _ in range(2)]
+    with asking_nothing(monkeypatch, watched=False):
+        stretch(*given)  # what a batch keeps from its first use on
+    with asking_nothing(monkeypatch):
+        made = [x for x in stretch(*given) if x.requires_grad]
+        trained = [*given, *(p for p in model.parameters() if p.requires_grad)]
+        found = torch.autograd.grad(made, trained, [torch.empty_like(x) for x in made], allow_unused=True)
+    assert sum(gradient is not None for gradient in found) > len(trained) / 2
+
+
+def test_only_rollouts_of_fixed_shape_are_captured_and_only_on_a_device() -> None:
+    module = module_on("cpu")
+    assert module.simulator.rollout.cuda_graph == RolloutSettings().cuda_graph and not module.graphs.serves
+
+
+@pytest.mark.gpu
+@TEMPLATES
+def test_gpu_replays_have_the_losses_and_gradients_of_the_steps(template: Any) -> None:
+    expected, gradients = optimised(module_on("cuda", template=template, edges="rest", cuda_graph=False), 3)
+    module = module_on("cuda", template=template, edges="rest", cuda_graph=True)
+    assert module.graphs.serves
+    found, own = optimised(module, 3)
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, rel=1e-3)
+    for name, gradient in own.items():
+        truth = gradients.get(name, torch.zeros_like(gradient))
+        torch.testing.assert_close(gradient, truth, atol=1e-3 * float(truth.abs().max()), rtol=1e-3, msg=name)
