@@ -54,7 +54,8 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(joint: Path, ot
     assert all(torch.equal(frozen[name], source[name]) for name in shared)
     assert any(not torch.equal(free[name], source[name]) for name in shared if name.startswith(NETWORK))
     assert float(free["model.predictor.node_normaliser.count"]) > float(source["model.predictor.node_normaliser.count"])
-    own = [name for name in frozen if name.startswith(("model.attributes", "model.log_density", "initial_states.velocity"))]
+    prefixes = ("model.attributes", "model.log_density", "initial_states.velocity")
+    own = [name for name in frozen if name.startswith(prefixes)]
     assert len(own) == 2 + 3 and all(bool(frozen[name].any()) for name in own)  # of one scene and its three sequences
 
 
