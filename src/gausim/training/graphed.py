@@ -9,7 +9,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, SimState
+from gausim.core import SimState
+from gausim.models.rollout.cuda_graph import not_captured
 from gausim.models.step.simulator import GausSim
 from gausim.training.contracts import SceneBatch
 from gausim.training.contracts import Step as PredictedStep
@@ -93,11 +94,7 @@ class GraphedRollouts:
             with torch.enable_grad():
                 made: Any = torch.cuda.make_graphed_callables(stretch, given, allow_unused_input=True)
         except RuntimeError as error:
-            raise ConfigError(
-                "model.simulator.rollout.cuda_graph: the rollout cannot be captured "
-                f"({str(error).splitlines()[0]}). Something in it waits for the device "
-                "or has a shape that depends on values; set it to false."
-            ) from error
+            raise not_captured("rollout", error) from error
         finally:
             gc.enable()
         with torch.no_grad():

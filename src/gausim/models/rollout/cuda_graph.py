@@ -16,6 +16,15 @@ WARM_UP = 3  # steps before a capture: lazy initialisation and autotuning must b
 StepFunction = Callable[[SimState, Tensor | None], SteppedFrame]
 
 
+def not_captured(what: str, error: RuntimeError) -> ConfigError:
+    """The error of a step or rollout that a CUDA graph cannot capture."""
+    return ConfigError(
+        f"model.simulator.rollout.cuda_graph: the {what} cannot be captured "
+        f"({str(error).splitlines()[0]}). Something in it waits for the device "
+        "or has a shape that depends on values; set it to false."
+    )
+
+
 class GraphedStep:
     """A step without loss gradients, captured at its first call and replayed at later ones.
 
@@ -70,9 +79,5 @@ class GraphedStep:
             with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 result = self._step(self._state, force)
         except RuntimeError as error:
-            raise ConfigError(
-                "model.simulator.rollout.cuda_graph: the step cannot be captured "
-                f"({str(error).splitlines()[0]}). Something in it waits for the device "
-                "or has a shape that depends on values; set it to false."
-            ) from error
+            raise not_captured("step", error) from error
         return graph, result
