@@ -18,8 +18,8 @@ def test_cost_goes_on_where_a_checkpoint_ended() -> None:
     later = TrainingCost()
     later.load_state_dict({**first, "seconds": 120.0, "cpu_seconds": 90.0})
     later.begin()
-    start = time.process_time()
-    while time.process_time() - start < 0.05:
+    wall, processor = time.perf_counter(), time.process_time()
+    while min(time.perf_counter() - wall, time.process_time() - processor) < 0.06:
         torch.rand(1000).sort()
     second = later.state_dict()
     assert second["seconds"] >= 120.05 and 90.05 <= second["cpu_seconds"] < 95
