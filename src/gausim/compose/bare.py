@@ -102,11 +102,10 @@ def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMateria
     config = RunDirectory(base).config().get("model", {})
     node = OmegaConf.create(config).get("simulator")
     model = None if node is None else _built(node, scene, fps)
-    if model is None or not isinstance(model.template, MaterialTemplate) or not model.template.named_attributes:
+    if model is None or not isinstance(model.template, MaterialTemplate):
         raise ConfigError(
-            f"--from {base}: expected a run of the neural simulator whose attributes are stiffness and damping "
-            "(model=gausim model.simulator.template.named_attributes=true). Pretrain one: `gausim train "
-            "experiment=pretrain data.root=CORPUS`."
+            f"--from {base}: expected a run of the neural simulator (model=gausim), whose attributes are stiffness and "
+            "damping. Pretrain one: `gausim train experiment=pretrain data.root=CORPUS`."
         )
     load_shared(model, base, config)
     model.freeze(scenes=True)

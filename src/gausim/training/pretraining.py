@@ -109,11 +109,8 @@ def _give(
         ConfigError: the model's template decodes no material.
     """
     template = model.template
-    if not isinstance(template, MaterialTemplate) or not template.named_attributes:
-        raise ConfigError(
-            "model.simulator.template.named_attributes: expected true (of model=gausim), so that attributes can be set "
-            "to a known material."
-        )
+    if not isinstance(template, MaterialTemplate):
+        raise ConfigError("model: expected gausim, whose attributes can be set to a known material.")
     attributes = model.attributes[scene_id].zero_()
     model.log_density[scene_id].copy_(density.log())
     attributes[:, 0] = stiffness.log()

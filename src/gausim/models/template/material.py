@@ -5,17 +5,21 @@ The geometry is computed once per scene: the lowest modes Phi of the solid body 
 to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all scenes map
 each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
 
-    s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
+    s_i, b_i, d_i = decode(a_i) + (a_i1, a_i1, a_i2)
+    p_ij, q_ij, g_ij = decode(a_i, a_j, distance) + (m, 0, m) with m = (a_i1 + a_j1) / 2
 
-With ``named_attributes`` the first attribute is itself the logarithm of stiffness over that of a reference material,
-the second that of damping, and the decoders add to them: (a_i1, a_i1, a_i2) to s, b and d, and the mean of a_i1 and
-a_j1 to p and g. These factors give, in modal coordinates z,
+The first attribute is thus itself the logarithm of stiffness over that of a reference material, the second that of
+damping. These factors give, in modal coordinates z,
 
     K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
     M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of units, and of matter between them
-    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                damping
+    C = 2 (sum_i t_i rho_i M_i + sum_ij (t_i + t_j) / 2 e^{q_ij} T_ij)     drag, with t_i = tanh(c_0 e^{d_i} / 2)
+    D = C + (tr C / (4 tr M) + c_1) K                      damping
 
-k, c_0 and c_1 are trained numbers common to all scenes. The links of stiffness e^{g_ij} are springs with geometric
+k, c_0 and c_1 are trained numbers common to all scenes. In a step of the trapezoidal rule an even drag c_0 reduces the
+amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the first part of the factor
+of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and strong drag would turn the
+velocity round instead of stopping it. The links of stiffness e^{g_ij} are springs with geometric
 nonlinearity. A frame is the step that all modal templates have in common
 (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
 that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for
@@ -49,7 +53,7 @@ LARGEST_LOG = 2.5
 AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
 # as a body's periods are wrong, strong damping fits best, and training is slow to reduce it again.
-GAIN, DAMPING_GAIN = 10.0, 2.0
+GAIN, DAMPING_GAIN = 10.0, 0.5
 # Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
 
@@ -176,7 +180,6 @@ class MaterialTemplate(Template):
         hidden: int = 48,
         period: float = 8.0,
         damping: float = 0.02,
-        named_attributes: bool = False,
         conserve_volume: bool = True,
     ) -> None:
         """Builds the scenes and the decoders; for the equations see the module's docstring.
@@ -192,19 +195,17 @@ class MaterialTemplate(Template):
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
-            named_attributes: the first two attributes are the logarithms of stiffness and damping, and the network's
-                correction scales with the body's stiffness, so that a network knows bodies of any stiffness.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
-            ConfigError: fewer than two attributes where they are named.
+            ConfigError: fewer than two attributes.
         """
         super().__init__()
-        if named_attributes and attributes < 2:
+        if attributes < 2:
             raise ConfigError(
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
-        self.conserve_volume, self.named_attributes = conserve_volume, named_attributes
+        self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
         self.bodies = nn.ModuleList(
             BodyModes(h, finest, f, modes=modes, spacing=spacing, links=self.links.neighbours)
@@ -227,14 +228,12 @@ class MaterialTemplate(Template):
         """s, b and d of every unit; p, q and g of every link (see the module's docstring).
 
         The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
-        What the decoders give is bounded; named attributes are not, so that one material may be many times as stiff as
-        another.
+        What the decoders give is bounded; the first two attributes are not, so that one material may be many times as
+        stiff as another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
         a, b = (attributes.index_select(0, end) for end in body.springs.ends)
         links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
-        if not self.named_attributes:
-            return _saturated(units), _saturated(links)
         stiffness, damping = attributes[:, 0], attributes[:, 1]
         own, mean = torch.stack((stiffness, stiffness, damping), -1), (a + b)[:, 0] / 2
         between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
@@ -255,8 +254,11 @@ class MaterialTemplate(Template):
         heavy = density[:, None, None] * body.inertia
         root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
         inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
-        dragged = root.mT @ (units[:, 2, None, None].exp() * heavy).flatten(0, 1)
-        damping = drag * frame * dragged + viscosity / frame * k * stiffness
+        lost = (drag * frame * units[:, 2].exp()).div(2).tanh()
+        slowed = sum(lost.index_select(0, end) for end in body.springs.ends)[:, None, None]  # twice a link's mean
+        dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
+        dragged = dragged + body.between.flatten(0, 1).mT @ (slowed * tied).flatten(0, 1)
+        damping = dragged + (dragged.trace() / inertia.trace() / 4 + viscosity / frame) * k * stiffness
         uneven = k * (units[:, :2].exp() - 1)
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
         return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven, tense)
@@ -298,8 +300,7 @@ class MaterialTemplate(Template):
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
             matrices = self.matrices(scene_id, density, attributes, batch.levels[-1].dt.index_select(0, rows[:1])[0, 0])
-            reference = math.exp(self.start[0]) if self.named_attributes else None
-            return PreparedMaterial(self.body(scene_id), matrices, reference)
+            return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.start[0]))
 
         return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
@@ -317,10 +318,10 @@ def _saturated(logarithms: Tensor) -> Tensor:
 class PreparedMaterial(ModalScene):
     """Matrices of a scene's step between two updates of the parameters."""
 
-    def __init__(self, body: BodyModes, matrices: Matrices, reference: float | None) -> None:
+    def __init__(self, body: BodyModes, matrices: Matrices, reference: float) -> None:
         """Computes the constants; loss gradients flow through them.
 
-        ``reference`` is k at the start [1 / frame^2], to which corrections are relative; None: they are not.
+        ``reference`` is k at the start [1 / frame^2], to which corrections are relative.
         """
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
@@ -341,14 +342,12 @@ class PreparedMaterial(ModalScene):
         own = own + self.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
-    def correction_unit(self) -> Float[Tensor, ""] | None:
+    def correction_unit(self) -> Float[Tensor, ""]:
         """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.
 
         A network that corrects accelerations then needs to know neither frame rate nor stiffness. For stiff bodies it
         is reduced as the trapezoidal rule reduces their pull.
         """
-        if self.reference is None:
-            return None
         reference = self.reference * self.values.sum()
         pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
         return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
