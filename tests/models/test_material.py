@@ -16,7 +16,7 @@ from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate, PreparedMaterial
+from gausim.models.template.material import DAMPING_GAIN, Links, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
 
@@ -64,19 +64,22 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
     found = template.matrices(0, density, attributes, 1 / 24)
     k, c0, c1 = (2 * np.pi / 8) ** 2, 0.02, 0.02
     rho = (2.5 * torch.tanh(density / 2.5)).exp()
+    lost = torch.tanh(c0 * units[:, 2].exp() / 2)
     stiffness, inertia, drag = (torch.zeros(9, 9, dtype=torch.float64) for _ in range(3))
     for i in range(len(density)):
         own = sum(torch.outer(body.inertia[i, a], body.inertia[i, a]) for a in range(3))
         stiffness += units[i, 0].exp() * body.stiffness[0, i] + units[i, 1].exp() * body.stiffness[1, i]
         inertia += rho[i] * own
-        drag += rho[i] * units[i, 2].exp() * own
+        drag += 2 * rho[i] * lost[i] * own
     for e in range(body.springs.ends.shape[1]):
         stretch = 0.3 * links[e, 0].exp() + 0.15 * links[e, 2].exp()
         stiffness += stretch * torch.outer(body.stretch[e], body.stretch[e])
-        inertia += 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
+        tied = 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
+        inertia, drag = inertia + tied, drag + lost[body.springs.ends[:, e]].sum() * tied
     torch.testing.assert_close(found.stiffness, k * stiffness)
     torch.testing.assert_close(found.inertia, inertia)
-    torch.testing.assert_close(found.damping, c0 * drag + c1 * k * stiffness)
+    viscosity = c1 + drag.trace() / inertia.trace() / 4
+    torch.testing.assert_close(found.damping, drag + viscosity * k * stiffness)
     torch.testing.assert_close(found.links, 0.15 * k * links[:, 2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
@@ -86,8 +89,24 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
     template, (density, attributes) = _template(hierarchy), _material(hierarchy)
     fast, slow = (template.matrices(0, density, attributes, dt) for dt in (1 / 48, 1 / 24))
     torch.testing.assert_close(slow.stiffness, 4 * fast.stiffness)
-    torch.testing.assert_close(slow.damping, 2 * fast.damping)
     torch.testing.assert_close(slow.inertia, fast.inertia)
+
+
+@pytest.mark.parametrize("frames", [24, 48])
+def test_an_even_drag_damps_all_modes_alike_however_fast_and_strong_it_is(hierarchy, frames: int) -> None:
+    """Amplitudes fall as exp(-c t / 2): the product of the two roots of a mode's step is exp(-c) a frame."""
+    template, free = _template(hierarchy, links=Links(springs=0.0)), hierarchy.levels[1].count
+    template.link_decoder.requires_grad_(False).apply(lambda m: [p.zero_() for p in m.parameters()])
+    template.damping[1] = -np.inf  # no viscosity
+    for strength in (0.01, 1.0, 5.0):
+        attributes = torch.zeros(free, 3, dtype=torch.float64)
+        attributes[:, 1] = np.log(strength / 0.02)
+        template.unit_decoder.requires_grad_(False).apply(lambda m: [p.zero_() for p in m.parameters()])
+        found = template.matrices(0, torch.zeros(free, dtype=torch.float64), attributes, 1 / frames)
+        implicit, half = found.inertia + found.stiffness / 4, found.damping / 2
+        product = torch.linalg.solve(implicit + half, implicit - half)
+        expected = np.exp(-strength * 24 / frames) * torch.eye(9, dtype=torch.float64)
+        torch.testing.assert_close(product, expected, atol=1e-6, rtol=0)
 
 
 @pytest.fixture

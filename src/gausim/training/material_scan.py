@@ -11,13 +11,14 @@ from torch import Tensor
 
 from gausim.data.pretraining import BodyData, CorpusDataModule
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
 from gausim.runs.bar import with_bar
 from gausim.training import modal_fit
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.optimizers import OptimizerSettings
 
-# Candidates of attributes 0 and 1, logarithms of stiffness and damping over the reference's; they are scanned in turn.
-CANDIDATES = torch.linspace(-3.5, 3.5, 15), torch.linspace(-3, 4, 8)
+# Candidates, scanned in turn: logarithms of stiffness over the reference's, and of drag [1 / frame at 24 per second].
+STIFFNESS, DRAG = torch.linspace(-3.5, 3.5, 15), torch.linspace(-8, 0.5, 9)
 MOST_TURNS = 8
 # Most steps of the compared rollouts, and frames between their beginnings.
 STEPS, APART = 4, 2
@@ -46,14 +47,15 @@ def _scan(model: GausSim, scene_id: int, z: Float[Tensor, "S F M"]) -> None:
     """Sets attributes 0 and 1 of a body to the even material that explains its seen frames best."""
     attributes, steps = model.attributes[scene_id].data, min(STEPS, z.shape[1] - 2)
     motion = known_motion(z, torch.arange(1, z.shape[1] - steps, APART), steps)
+    candidates = STIFFNESS, DRAG - cast(MaterialTemplate, model.template).start[1]
     unchanged, turn = 0, 0
-    while unchanged < len(CANDIDATES) and turn < MOST_TURNS:
-        number, errors = turn % len(CANDIDATES), []
+    while unchanged < len(candidates) and turn < MOST_TURNS:
+        number, errors = turn % len(candidates), []
         before = attributes[0, number].clone()
-        for value in CANDIDATES[number]:
+        for value in candidates[number]:
             attributes[:, number] = value
             errors.append(motion.error(model.modal_scene(scene_id)))
-        attributes[:, number] = CANDIDATES[number][int(torch.stack(errors).argmin())]
+        attributes[:, number] = candidates[number][int(torch.stack(errors).argmin())]
         unchanged, turn = unchanged + 1 if attributes[0, number] == before else 0, turn + 1
 
 
