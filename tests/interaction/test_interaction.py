@@ -12,7 +12,7 @@ from msgspec.structs import replace as changed
 from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
 from gausim.interaction.interaction import Interaction, replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
-from gausim.interaction.session import Force, Gravity, Impulse, MadeWith, Pin, Release, Reset, Unpin, Wind
+from gausim.interaction.session import Force, Gravity, Impulse, MadeWith, Material, Pin, Release, Reset, Unpin, Wind
 from gausim.models.rollout.dynamics import SceneDynamics
 
 X, Y, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -208,6 +208,7 @@ def test_what_cannot_be_done_is_refused_and_not_recorded(make_interaction) -> No
         (Force(Unit(3, 0), X, 1.0), "level 3: 'column' has levels 0 to 2"),
         (Force(Unit(1, 999), X, 1.0), "unit 999: level 1 of 'column' has units 0 to"),
         (Force(Ball((9.0, 9.0, 9.0), 0.1), X, 1.0), "no kernel of 'column' lies within 0.1 diagonals"),
+        (Material(2.0), "its material cannot be set. Take a run of model=gausim"),
     ):
         with pytest.raises(ConfigError, match=message):
             live.act(event)

@@ -12,10 +12,11 @@ import torch
 from helpers.bodies import NEURAL, make_model, make_scene, make_state, pull_of
 from helpers.simulators import silence
 
-from gausim.core import SimState
+from gausim.core import Adjustable, SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.hierarchy.units import FixedUnits, fixed_units
+from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.template.material import DAMPING_GAIN, Links, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
@@ -367,3 +368,24 @@ def test_kernels_have_the_material_of_their_units(neural) -> None:
         assert torch.equal(torch.isfinite(values), free) and (values[free] > 0).all()
         for u in unit[free].unique():
             assert len(values[free & (unit == u)].unique()) == 1
+
+
+def test_every_model_of_it_can_be_made_stiffer(neural) -> None:
+    """Four times the stiffness swings twice as fast; models without a material cannot be adjusted."""
+    model = neural()
+    silence(model)
+    live, rest = scene_dynamics(model), model.scenes[0].means
+    assert isinstance(live, Adjustable) and not isinstance(scene_dynamics(make_model(model.scenes[0])), Adjustable)
+    period = model.template.slowest_period(0, *_material_of(model))
+    live.adjust(4.0, 1.0)
+    stiffer = model.template.slowest_period(0, *_material_of(model))
+    assert stiffer == pytest.approx(period / 2, rel=0.1)  # the decoders read it, too
+    live.adjust(1.0, 1.0)  # over the beginning, not over the last
+    assert model.template.slowest_period(0, *_material_of(model)) == pytest.approx(period, rel=1e-6)
+    assert torch.isfinite(live.rollout(SimState(rest, 0.99 * rest), 3).positions).all()
+
+
+def _material_of(model):
+    batch = model.batch((0,))
+    units = fixed_units(batch, model.masses(batch)[0], model.attributes[0])[1][-1]
+    return units.log_density, units.attributes

@@ -56,9 +56,9 @@ def add_scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGrou
     add = group.add_argument
     add("--from", dest="base", metavar="RUN", type=Path, help="run of model=gausim whose network moves the scene")
     add("--stiffness", type=float, metavar="S",
-        help="with --from: the slowest swing takes S^(-1/2) seconds (default: 1)")  # fmt: skip
+        help="the slowest swing takes S^(-1/2) seconds (default with --from: 1)")  # fmt: skip
     add("--damping", type=float, metavar="D",
-        help="with --from: amplitudes fall as exp(-D t / 2) [1 / s] (default: 0.5)")  # fmt: skip
+        help="amplitudes fall as exp(-D t / 2) [1 / s] (default with --from: 0.5)")  # fmt: skip
     add("--fps", type=float, default=30.0, help="frames per second (default: 30)")
     add("--seed", type=int, default=0, help="of the random weights of an untrained model (default: 0)")
     add_pin_options(parser)
@@ -69,18 +69,14 @@ def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options:
     """The scene with the model of :func:`add_scene_options`; ``options`` are those of `open_scene`.
 
     Raises:
-        ConfigError: a material is given without a run, or a number is not positive.
+        ConfigError: a number is not positive.
     """
     from gausim.compose.bare import EvenMaterial, open_scene
-    from gausim.core.errors import ConfigError
 
     given = {name: getattr(arguments, name) for name in ("stiffness", "damping")}
     material = {name: value for name, value in given.items() if value is not None}
-    if material and arguments.base is None:
-        raise ConfigError(f"--{next(iter(material))}: the material of a scene needs a trained network, --from RUN.")
-    return open_scene(
-        scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=EvenMaterial(**material), **options
-    )
+    even = EvenMaterial(**material) if material else None
+    return open_scene(scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=even, **options)
 
 
 def positive(text: str) -> int:

@@ -17,7 +17,7 @@ from gausim.core.errors import ConfigError
 from gausim.core.state import initial_sway
 from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
-from gausim.models.rollout.dynamics import MaterialDynamics, SceneDynamics
+from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import MaterialTemplate
 from gausim.ops.selection import require_pinned
@@ -68,9 +68,10 @@ def open_scene(
     """Opens a scene without videos, some of its kernels pinned, for interaction.
 
     ``base`` is a trained run of the neural simulator whose network and decoders move it, with an even ``material``;
-    None: an untrained model of this ``seed``. ``sway`` is the initial displacement per frame of the kernel farthest
-    from the pins [diagonals], ``gravity`` the unit of weight [scene units / s^2] (9.81), ``most_force`` the largest
-    force [weights], ``keep`` the number of latest frames that are kept (None: all).
+    None: an untrained model of this ``seed``, of the reference material where no ``material`` is given. ``sway`` is the
+    initial displacement per frame of the kernel farthest from the pins [diagonals], ``gravity`` the unit of weight
+    [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the number of latest frames that
+    are kept (None: all).
 
     Raises:
         SceneError: no kernel is pinned.
@@ -80,10 +81,12 @@ def open_scene(
         raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
-    model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base, material or EvenMaterial())
+    model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base)
+    if material is not None or base is not None:
+        even = material or EvenMaterial()
+        give_even_material(model, 0, period=even.period, damping=even.damping)
     initial = initial_sway(scene, sway)
-    kind = SceneDynamics if base is None else MaterialDynamics
-    dynamics = kind(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
+    dynamics = scene_dynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
     run = "untrained" if base is None else base.resolve().name
     made_with = MadeWith.of(scene, model, initial, settings=UNTRAINED, run=run)
     return Interaction(
@@ -97,8 +100,8 @@ def _untrained(scene: GaussianScene, fps: float) -> GausSim:
     return _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
 
 
-def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMaterial) -> GausSim:
-    """The simulator of a run's configuration with its shared weights, and an even material."""
+def _of_base(scene: GaussianScene, fps: float, base: Path) -> GausSim:
+    """The simulator of a run's configuration with its shared weights."""
     config = RunDirectory(base).config().get("model", {})
     node = OmegaConf.create(config).get("simulator")
     model = None if node is None else _built(node, scene, fps)
@@ -109,7 +112,6 @@ def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMateria
         )
     load_shared(model, base, config)
     model.freeze(scenes=True)
-    give_even_material(model, 0, period=material.period, damping=material.damping)
     return model.eval()
 
 

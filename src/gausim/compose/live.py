@@ -107,7 +107,7 @@ def _method(
 ) -> tuple[SimState, Steppable, Tensor, float | None, HandPath | None]:
     """Initial state, dynamics, masses, the limit of the energy, and the recorded path of the hands."""
     from gausim.core import FittedDynamics, SimState
-    from gausim.models.rollout.dynamics import SceneDynamics
+    from gausim.models.rollout.dynamics import scene_dynamics
     from gausim.models.step.simulator import GausSim
     from gausim.ops.covariance import kernel_volumes
     from gausim.training.fitted.fitting import StagedFit
@@ -125,7 +125,7 @@ def _method(
     numbers = range(item.first_sequence, item.first_sequence + len(names))
     starts = [states.state(i).detach() for i in numbers]
     ceiling = energy_ceiling(module.model, item.scene_id, [start.previous.to(scene.means) for start in starts])
-    dynamics = SceneDynamics(module.model, item.scene_id, energy_ceiling=ceiling)
+    dynamics = scene_dynamics(module.model, item.scene_id, energy_ceiling=ceiling)
     initial = SimState(scene.means, scene.means) if sequence == REST else starts[names.index(sequence)]
     path = None if sequence == REST else item.data.sequences[names.index(sequence)].hands
     return initial, dynamics, dynamics.masses, ceiling, path

@@ -321,8 +321,8 @@ class Interaction:
         """Changes the material."""
         if not isinstance(self._dynamics, Adjustable):
             raise ConfigError(
-                f"{self.made_with.run or 'this method'}: its material was learned and cannot be set. Take a scene that "
-                "a pretrained network moves (--from BASE)."
+                f"{self.made_with.run or 'this method'}: its material cannot be set. Take a run of model=gausim, or a "
+                "scene (--scene)."
             )
         self._dynamics.adjust(event.stiffness, event.damping)
         self._go_on()

@@ -13,6 +13,7 @@ from gausim.models.reference.reference import StillReference, hand_motion
 from gausim.models.rollout.cuda_graph import GraphedStep
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
 from gausim.nn.mode import evaluating
 
 INTERVAL = 64  # frames between two checks for finite values on a CUDA device; each check synchronises the host
@@ -67,6 +68,12 @@ class MaterialDynamics(SceneDynamics):
         changed[:, 1] += math.log(damping)
         self.model.attributes[self.scene_id].data.copy_(changed)
         self.energy_ceiling = None if self._ceiling is None else stiffness * self._ceiling  # the same motion
+
+
+def scene_dynamics(model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> SceneDynamics:
+    """The dynamics of a scene; where the model's template decodes a material, it can be adjusted."""
+    kind = MaterialDynamics if isinstance(model.template, MaterialTemplate) else SceneDynamics
+    return kind(model, scene_id, energy_ceiling=energy_ceiling)
 
 
 class SceneStepper:

@@ -285,6 +285,7 @@ class MaterialTemplate(Template):
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
 
+    @torch.no_grad()
     def slowest_period(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"]
     ) -> float:
