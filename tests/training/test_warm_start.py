@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,17 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
     before = float(known(12).error(part))
     assert before == pytest.approx(0.0, abs=1e-4)
     assert losses[-1] < 1e-2 and float(known(12).error(model.modal_scene(0))) < 0.1 * 12
+
+    def astray(steps: int) -> modal_fit.KnownMotion:
+        motion = known(steps)
+        return motion if len(later) < 45 else replace(motion, after=5 * motion.after)
+
+    later: list[float] = []
+    for loss in modal_fit.fit(model, [(0, astray)], settings, groups, longest=12, updates=60):
+        later.append(loss)
+    distances = torch.stack([d.mean() for d in known(12).distances(model.modal_scene(0))])
+    assert len(later) == 60 and later[-2] > 1 and later[-1] == min(later[30:])
+    assert float(distances.mean()) == pytest.approx(later[-1], rel=1e-4)
 
 
 def test_wrong_settings_are_refused() -> None:

@@ -10,6 +10,7 @@ with T growing from 2 to its longest in the first half and rates that fall as a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -64,6 +65,9 @@ def fit(
 ) -> Iterator[float]:
     """Fits parameters of a model to known motion; yields the loss of every update.
 
+    An update may lead far astray. So the parameters are in the end those of the least loss at the largest T, which is
+    what the last update yields.
+
     Args:
         model: its template has modes.
         motions: for some scenes, by their numbers, the known motion for a given T; it may depend on parameters.
@@ -73,7 +77,9 @@ def fit(
         updates: number of updates.
     """
     settings = replace(settings, schedule=FALLING)
-    optimizer = settings.build({name: [p for p in own if p.requires_grad] for name, own in groups.items()})
+    trained = {name: [p for p in own if p.requires_grad] for name, own in groups.items()}
+    weights = [p for own in trained.values() for p in own]
+    optimizer, least, kept = settings.build(trained), math.inf, [p.detach().clone() for p in weights]
     for update in range(updates):
         steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / GROWING))
         settings.set_rates(optimizer, update, updates)
@@ -85,6 +91,13 @@ def fit(
             if bool(torch.isfinite(loss)):
                 loss.backward()
             total += float(loss.detach())
-        settings.clip(optimizer)
-        optimizer.step()
-        yield total
+        if (steps == longest or update == updates - 1) and total < least:
+            least, kept = total, [p.detach().clone() for p in weights]
+        if update < updates - 1:
+            settings.clip(optimizer)
+            optimizer.step()
+            yield total
+    with torch.no_grad():
+        for weight, value in zip(weights, kept, strict=True):
+            weight.copy_(value)
+    yield least
