@@ -97,12 +97,12 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
 def test_an_even_drag_damps_all_modes_alike_however_fast_and_strong_it_is(hierarchy, frames: int) -> None:
     """Amplitudes fall as exp(-c t / 2): the product of the two roots of a mode's step is exp(-c) a frame."""
     template, free = _template(hierarchy, links=Links(springs=0.0)), hierarchy.levels[1].count
-    template.link_decoder.requires_grad_(False).apply(lambda m: [p.zero_() for p in m.parameters()])
+    for weight in (*template.unit_decoder.parameters(), *template.link_decoder.parameters()):
+        weight.zero_()
     template.damping[1] = -np.inf  # no viscosity
     for strength in (0.01, 1.0, 5.0):
         attributes = torch.zeros(free, 3, dtype=torch.float64)
         attributes[:, 1] = np.log(strength / 0.02)
-        template.unit_decoder.requires_grad_(False).apply(lambda m: [p.zero_() for p in m.parameters()])
         found = template.matrices(0, torch.zeros(free, dtype=torch.float64), attributes, 1 / frames)
         implicit, half = found.inertia + found.stiffness / 4, found.damping / 2
         product = torch.linalg.solve(implicit + half, implicit - half)

@@ -82,9 +82,10 @@ def open_scene(
     require_pinned(scene)
     torch.manual_seed(seed)
     model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base)
-    if material is not None or base is not None:
-        even = material or EvenMaterial()
-        give_even_material(model, 0, period=even.period, damping=even.damping)
+    if material is None and base is not None:
+        material = EvenMaterial()
+    if material is not None:
+        give_even_material(model, 0, period=material.period, damping=material.damping)
     initial = initial_sway(scene, sway)
     dynamics = scene_dynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
     run = "untrained" if base is None else base.resolve().name
