@@ -14,6 +14,7 @@ from torch import Tensor
 from gausim.core import ConfigError, SimState
 from gausim.losses import Objective
 from gausim.models.template.template import RestTemplate, Template
+from gausim.training.graphed import GraphedRollouts
 from gausim.training.module import GausSimModule
 from gausim.training.terms.free_motion import energy_growth
 
@@ -50,7 +51,7 @@ def test_growth_is_that_of_the_mean_energy_from_stretch_to_stretch() -> None:
     model = Spiral(factor)
     state = SimState(model.batch_of.rest + 0.1, model.batch_of.rest)
     draws = torch.Generator().manual_seed(0)
-    found = list(energy_growth(model, model.batch_of, state, 15, 5, draws))
+    found = list(energy_growth(model, model.batch_of, state, 15, 5, draws, GraphedRollouts(model)))
     assert len(found) == 2  # the first stretch is what the second is compared with
     for growth in found:
         assert growth.tolist() == pytest.approx([10 * math.log(1.02), 0.0], rel=1e-4)
@@ -64,7 +65,7 @@ def test_growth_is_that_of_the_mean_energy_from_stretch_to_stretch() -> None:
 def test_what_explodes_is_not_learned_from() -> None:
     model = Spiral(torch.tensor([1.0, 1e12], requires_grad=True))
     state = SimState(model.batch_of.rest + 0.1, model.batch_of.rest)
-    assert list(energy_growth(model, model.batch_of, state, 9, 3, torch.Generator())) == []
+    assert list(energy_growth(model, model.batch_of, state, 9, 3, torch.Generator(), GraphedRollouts(model))) == []
 
 
 def _module(objective: Objective, template: Callable[..., Template], scenes: Sequence[int] = (0,)) -> GausSimModule:

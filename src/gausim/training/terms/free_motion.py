@@ -31,7 +31,7 @@ def energy_growth(
     frames: int,
     stretch: int,
     draws: torch.Generator,
-    graphs: GraphedRollouts | None = None,
+    graphs: GraphedRollouts,
 ) -> Iterator[Float[Tensor, " S"]]:
     """Continues the motion of a batch without forces and computes the growth of its energy.
 
@@ -48,12 +48,11 @@ def energy_growth(
     state = SimState(
         *(batch.rest + size * (x - batch.rest) for x in (state.positions.detach(), state.previous.detach()))
     )
-    roll_out = GraphedRollouts(model).windows if graphs is None else graphs.windows
     with torch.no_grad():
-        ((_, made),) = roll_out(batch, state, stretch, stretch, isolated=True)
+        ((_, made),) = graphs.windows(batch, state, stretch, stretch, isolated=True)
         before = _mean_energy(model, batch, state, made)
     state = after(made, state)
-    for _, made in roll_out(batch, state, frames - stretch, stretch, isolated=True):
+    for _, made in graphs.windows(batch, state, frames - stretch, stretch, isolated=True):
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
             return  # exploded; loss gradients are not finite (the step's only read that blocks on a GPU)
@@ -75,7 +74,7 @@ class FreeMotion:
         weight: weight of the energy growth; 0 for a model without an energy.
     """
 
-    def __init__(self, model: nn.Module, objective: Objective, graphs: GraphedRollouts | None = None) -> None:
+    def __init__(self, model: nn.Module, objective: Objective, graphs: GraphedRollouts) -> None:
         knows, weight = bool(getattr(model, "knows_energy", False)), objective.energy_weight
         if weight and not knows:
             name = type(getattr(model, "template", model)).__name__
