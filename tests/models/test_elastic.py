@@ -79,7 +79,7 @@ def test_energy_is_kept_without_damping_and_lost_with_it_for_random_mixing(elast
     for _ in range(1000):
         energies.append(float(prepared.energy(now, before)))
         after = prepared.after(now, before)
-        taken.append(float(prepared.dissipated(after, before)))
+        taken.append(float(prepared.dissipated(after, now, before)))
         before, now = now, after
     energy, lost = (torch.tensor(x, dtype=torch.float64) for x in (energies, taken))
     torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-6, atol=1e-9 * energies[0])

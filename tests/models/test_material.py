@@ -17,6 +17,7 @@ from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.rollout.dynamics import scene_dynamics
+from gausim.models.template import template
 from gausim.models.template.material import DAMPING_GAIN, Links, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
@@ -177,11 +178,12 @@ def test_the_step_solves_its_equation_with_the_slope_of_the_force(neural) -> Non
         return -at.detach()
 
     z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    least = torch.linalg.eigvalsh(springs.stiffening(springs.stretched(z), matrices.links)[0] - slope(matrices.links))
+    ends = [springs.stretched(z)] * 2
+    least = torch.linalg.eigvalsh(springs.stiffening(*ends, matrices.links)[0] - slope(matrices.links))
     assert least.min() > -1e-9 * least.max() and least.max() > 0  # compressed springs count as of their length
     taut = (z @ springs.modes.mT).unflatten(-1, (-1, 3)) + springs.offset
     only = (taut.norm(dim=-1)[0] > springs.length).double() * matrices.links
-    torch.testing.assert_close(springs.stiffening(springs.stretched(z), only)[0], slope(only))
+    torch.testing.assert_close(springs.stiffening(*ends, only)[0], slope(only))
     after = part.after(z, previous)
     ends = [springs.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
     bend, force = after - 2 * z + previous, springs.between(*ends, matrices.links)
@@ -189,6 +191,72 @@ def test_the_step_solves_its_equation_with_the_slope_of_the_force(neural) -> Non
     torch.testing.assert_close(
         bend @ matrices.inertia, force - lost, rtol=1e-3, atol=1e-3 * float(lost.detach().abs().max())
     )
+
+
+@torch.no_grad()
+def test_the_stiffness_between_two_states_is_the_slope_of_the_damped_force(neural) -> None:
+    model = neural()
+    springs, factor = model.template.body(0).springs, model.modal_scene(0).factor
+    draw = partial(torch.randn, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    z, other = 0.02 * draw(2, 1, 9)
+    first, second = springs.stretched(z), springs.stretched(other)
+    for damping in (0.0, 0.2):
+        tension = (first.stretch + second.stretch) / 2 + damping * (second.stretch - first.stretch)
+        only = (tension[0] > 0).double() * factor
+
+        def force(q, damping=damping, only=only):
+            return springs.between(first, springs.stretched(q[None]), only, damping)[0]
+
+        slope = torch.func.jacrev(force)(other[0])
+        torch.testing.assert_close(springs.stiffening(first, second, only, damping)[0], -2 * slope)
+
+
+@torch.no_grad()
+def test_damping_of_springs_takes_the_energy_that_is_lost_and_none_from_a_rotation(neural) -> None:
+    part = neural(template=partial(MaterialTemplate, modes=9, links=Links(damping=0.1))).modal_scene(0)
+    part.damping = torch.zeros_like(part.damping)
+    before, now = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    energies, taken = [], []
+    for _ in range(40):
+        energies.append(part.energy(now, before))
+        after = part.after(now, before)
+        taken.append(part.dissipated(after, now, before))
+        before, now = now, after
+    energy, lost = torch.cat(energies), torch.cat(taken)
+    torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-3, atol=1e-4 * float(energy[0]))
+    assert float(energy[-1]) < 0.9 * float(energy[0]) and bool((lost > 0).all())
+    springs, turn = part.springs, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    turned = (turn - torch.eye(3)).flatten().expand(1, int(springs.ends.max()) + 1, 9)
+    ends = springs.stretched(0 * now), springs.stretched(0 * now, springs.strained(turned))
+    assert float(springs.dissipated(*ends, part.factor, 0.1)) < 1e-12
+
+
+@torch.no_grad()
+def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia(neural, monkeypatch) -> None:
+    """A swing that turns springs by a tenth in a frame, the stiffest of them at 28 radians per frame."""
+    part = neural(template=partial(MaterialTemplate, modes=24, spacing=0.2, links=8)).modal_scene(0)
+    springs, times = part.springs, 10.0
+    along = (springs.offset[..., None] * springs.modes.unflatten(0, (-1, 3))).sum(1) / springs.length[:, None]
+    part.stiffness = part.stiffness + along.mT @ (((times - 1) * part.factor * springs.stiffness)[:, None] * along)
+    part.factor, part.damping = times * part.factor, torch.zeros_like(part.damping)
+    squares, modes = torch.linalg.eigh(part.stiffness)
+    assert float(squares[-1]) > 700
+    slowest = modes[:, 0]
+    slowest = slowest / (part.motions.unflatten(0, (-1, 12))[:, :3] @ slowest).norm(dim=-1).max()
+
+    def swing() -> torch.Tensor:
+        found = [0.7 * 0.3 * slowest[None], 0.3 * slowest[None]]
+        for _ in range(20):
+            found.append(part.after(found[-1], found[-2]))
+        return torch.stack(found)
+
+    made = swing()
+    monkeypatch.setattr(template, "CORRECTIONS", 30)
+    monkeypatch.setattr(template, "ASSEMBLED", 30)
+    exact = swing()
+    assert float((made - exact).norm() / exact.norm()) < 0.05
+    energies = [[float(part.energy(z[i + 1], z[i])) for i in range(len(z) - 1)] for z in (made, exact)]
+    assert max(energies[0]) < 1.01 * energies[0][0] and energies[1][-1] == pytest.approx(energies[1][0], rel=1e-9)
 
 
 def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
@@ -219,7 +287,7 @@ def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
     both = pull_of(springs, still, factor, turned) + springs.pull(turned, factor)
     assert float(both.norm()) < 1e-5 * float(springs.pull(turned, factor).norm())  # a rotation strains nothing
     stretched = 0.1 * torch.eye(3, dtype=torch.float64).flatten().expand(1, count, 9)
-    stiffer = springs.stiffening(springs.stretched(still, springs.strained(stretched)), factor)[0]
+    stiffer = springs.stiffening(*[springs.stretched(still, springs.strained(stretched))] * 2, factor)[0]
     assert torch.linalg.eigvalsh(stiffer)[0] > 0  # what is taut resists more in every direction
 
 

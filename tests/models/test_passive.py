@@ -42,9 +42,10 @@ def test_energy_grows_without_the_guard_and_not_with_it() -> None:
     for i in range(FRAMES, len(kept)):
         assert kept[i] <= max(kept[i - FRAMES : i]) * (1 + 1e-4)
     prepared = model.prepare(model.batch((0,)))
-    ends = [SimState(after, before) for before, after in zip(positions, positions[2:], strict=False)]
+    steps = list(zip(positions, positions[1:], positions[2:], strict=False))[FRAMES:-1]
     with torch.no_grad():
-        lost = torch.tensor([float(model.dissipated(prepared, both)) for both in ends[FRAMES:-1]]).cumsum(0)
+        taken = [float(model.dissipated(prepared, SimState(after, now), before)) for before, now, after in steps]
+        lost = torch.tensor(taken).cumsum(0)
     limits = max(kept[:FRAMES]) - lost
     assert (torch.tensor(kept[FRAMES + 2 :]) <= limits * (1 + 1e-4)).all()  # in the end damping wins
     assert float(limits[-1]) < 0.95 * float(limits[0]) and min(kept[-FRAMES:]) > 0
@@ -79,7 +80,7 @@ def test_a_held_back_step_takes_the_share_of_its_formula() -> None:
         start, limit = state, max(left[-FRAMES:])
         state = SimState(guard.step(start, None).positions, start.positions)
         energies.append(float(model.energy(batch, state)))
-        lost = float(model.dissipated(prepared, SimState(state.positions, start.previous)))
+        lost = float(model.dissipated(prepared, state, start.previous))
         left = [energy - lost for energy in left] + energies[-1:]
 
     def energy_with(share: float) -> float:

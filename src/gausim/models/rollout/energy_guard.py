@@ -76,7 +76,7 @@ class EnergyGuard:
                 result, energy = self._weakened(state, force, self._ceiling)
             if energy > self._ceiling:
                 result, energy = self._cut_short(result, state, self._ceiling)
-        lost = float(self._model.dissipated(self._prepared, SimState(result.positions, state.previous)))
+        lost = float(self._model.dissipated(self._prepared, _after(result, state), state.previous))
         self._last = deque((before - lost for before in self._last), self._last.maxlen)
         self._last.append(energy)
         self._made = SteppedFrame(result.positions, result.deformation_gradients, result.rotations)

@@ -180,9 +180,9 @@ class SceneModel(nn.Module, ABC):
         prepared = self.prepare(batch) if prepared is None else prepared
         return prepared.template.energy(_finest(prepared, state))
 
-    def dissipated(self, prepared: Prepared, ends: SimState) -> Float[Tensor, " S"]:
-        """Energy that the template's damping takes in a step; ``ends`` are the positions at t + 1 and t - 1."""
-        return prepared.template.dissipated(_finest(prepared, ends))
+    def dissipated(self, prepared: Prepared, after: SimState, previous: Float[Tensor, "K 3"]) -> Float[Tensor, " S"]:
+        """Energy that the template's damping takes in a step that ends with ``after`` and began at x_{t-1}."""
+        return prepared.template.dissipated(_finest(prepared, after), prepared.finest(previous))
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """Mode mixing of the template of a scene (:meth:`Template.mixing`); None where it has none."""

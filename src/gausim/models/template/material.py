@@ -20,7 +20,8 @@ k, c_0 and c_1 are trained numbers common to all scenes. In a step of the trapez
 amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the first part of the factor
 of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and strong drag would turn the
 velocity round instead of stopping it. The links of stiffness e^{g_ij} are springs with geometric
-nonlinearity. A frame is the step that all modal templates have in common
+nonlinearity, and with damping of their lengths, which no rotation of the body meets: without it, vibrations near the
+frame rate ring on. A frame is the step that all modal templates have in common
 (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
 that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for
 the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
@@ -65,6 +66,7 @@ class Links:
     neighbours: int = 12  # of a unit
     linear: float = 0.3  # initial stiffness and inertia of all linear links, as fractions (of the trace) of the body's
     springs: float = 0.15  # the same for the stiffness of nonlinear links; its linear part is in K, the rest in f and J
+    damping: float = 0.0  # of the nonlinear links' lengths, over their stiffness [frames at 24 per second]
 
 
 class BodyModes(nn.Module):
@@ -158,6 +160,7 @@ class Matrices:
     between: Float[Tensor, " E"]  # mass of every link in units of T_ij
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
     tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
+    link_damping: Tensor | float = 0.0  # of the nonlinear links' lengths, over their stiffness
 
 
 class MaterialTemplate(Template):
@@ -261,7 +264,8 @@ class MaterialTemplate(Template):
         damping = dragged + (dragged.trace() / inertia.trace() / 4 + viscosity / frame) * k * stiffness
         uneven = k * (units[:, :2].exp() - 1)
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
-        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven, tense)
+        slow = self.links.damping / frame
+        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven, tense, slow)
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, damping and density of the units as they enter K, D and M.
@@ -328,7 +332,7 @@ class PreparedMaterial(ModalScene):
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
-        self.factor = matrices.links
+        self.factor, self.spring_damping = matrices.links, matrices.link_damping
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.

@@ -80,36 +80,58 @@ class Springs(nn.Module):
         length = (squared + grown).clamp_min(1e-6 * squared).sqrt()
         return Stretched(change, length, grown / (length + self.length), along)
 
-    def stiffening(self, state: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, "S M M"]:
-        """The change of the stiffness from rest to a state.
+    def stiffening(
+        self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0
+    ) -> Float[Tensor, "S M M"]:
+        """Twice the negative derivative of :meth:`between` with respect to z of the second state.
 
-        The stiffness is the second derivative of the energy: (1 - t) n n^T + t I with t = 1 - |d_0| / |d| for a spring
-        of length |d| and direction n (at rest n n^T). Compressed springs (t < 0) buckle; for them t is set to 0, so
-        that the stiffness is positive semi-definite.
+        With d and l the means of both springs and of both lengths, n_0 and n the directions at rest and in the second
+        state, t = (tension over stiffness) / l and |d_0| the length at rest, a spring contributes k times
+
+            ((1 + 2 damping) / l - t / l) d n^T + t I - n_0 n_0^T
+
+        For one and the same state without damping this is the change of the stiffness from rest to it. Compressed
+        springs (t < 0) buckle; for them t I is left out, so that this matrix is positive semi-definite then.
         """
-        towards, rest = (state.change + self.offset) / state.length[..., None], self.offset / self.length[:, None]
-        t = (state.stretch / state.length).clamp_min(0)[..., None, None]
-        blocks = (1 - t) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
-        blocks = blocks + t * torch.eye(3, dtype=t.dtype, device=t.device)
+        length, tension = (first.length + second.length) / 2, _tension(first, second, damping)
+        middle = (first.change + second.change) / 2 + self.offset
+        towards, rest = (second.change + self.offset) / second.length[..., None], self.offset / self.length[:, None]
+        t = tension / length
+        grown = ((1 + 2 * damping - t) / length)[..., None] * middle
+        blocks = grown[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
+        blocks = blocks + t.clamp_min(0)[..., None, None] * torch.eye(3, dtype=t.dtype, device=t.device)
         turned = ((factor * self.stiffness)[:, None, None] * blocks) @ self.modes.unflatten(0, (-1, 3))
         return self.modes.mT @ turned.flatten(-3, -2)
 
-    def between(self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
-        """Mean nonlinear force from one state to another, whose work is exactly the loss of :meth:`potential`.
+    def between(
+        self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0
+    ) -> Float[Tensor, "S M"]:
+        """Mean nonlinear force from one state to another, whose work is the loss of :meth:`potential` and damping.
 
-        A spring pulls along the mean of both d as one of the mean of both lengths does (Simo and Tarnow 1992).
+        A spring pulls along the mean of both d as one of the mean of both lengths does (Simo and Tarnow 1992), and more
+        by ``damping`` times the growth of its length (Armero and Romero 2001), which no rotation changes.
         ``factor`` is on the stiffness, one number or one per spring (E,).
         """
         change, along = (first.change + second.change) / 2, (first.along + second.along) / 2
-        shrink = (first.stretch + second.stretch) / (first.length + second.length)
+        shrink = 2 * _tension(first, second, damping) / (first.length + second.length)
         nonlinear = shrink[..., None] * change + (shrink - along / self.length.square())[..., None] * self.offset
         nonlinear = (factor * self.stiffness)[:, None] * nonlinear
         return -(nonlinear.flatten(-2) @ self.modes)
+
+    def dissipated(
+        self, first: Stretched, second: Stretched, factor: Tensor | float, damping: Tensor | float
+    ) -> Float[Tensor, " S"]:
+        """Energy that ``damping`` takes from one state to another."""
+        return damping * (factor * self.stiffness * (second.stretch - first.stretch).square()).sum(-1)
 
     def potential(self, state: Stretched, factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
         """Potential energy of the nonlinear force."""
         linear = state.along.square() / self.length.square()
         return 0.5 * (factor * self.stiffness * (state.stretch.square() - linear)).sum(-1)
+
+
+def _tension(first: Stretched, second: Stretched, damping: Tensor | float) -> Tensor:
+    return (first.stretch + second.stretch) / 2 + damping * (second.stretch - first.stretch)
 
 
 def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:

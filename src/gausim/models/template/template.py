@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,8 +26,10 @@ from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
-# Corrections of a step for the springs: fewer lose energy in large swings, none adds any.
-CORRECTIONS = 4
+# Corrections of a step for the springs, and those of them for which their stiffness is computed. The first is that of
+# the state at the beginning. It misses how far springs turn within the frame: where they are far stiffer than inertia,
+# corrections with it alone do not converge. With the second, between the ends of the frame, they do.
+CORRECTIONS, ASSEMBLED = 3, 2
 DENSITY = "density over that at the beginning of training"
 
 
@@ -90,8 +92,8 @@ class PreparedTemplate:
         """
         raise NotImplementedError("the rest state has no energy")
 
-    def dissipated(self, motion: Motion) -> Float[Tensor, " S"]:
-        """Energy that the damping takes from every member in a step; ``motion`` is at t + 1 and t - 1.
+    def dissipated(self, motion: Motion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
+        """Energy that the damping takes from every member in a step from ``previous`` (t - 1) to the end of ``motion``.
 
         Raises:
             NotImplementedError: the template has no energy.
@@ -152,6 +154,7 @@ class ModalScene:
     damping: Float[Tensor, "M M"]  # modal damping
     springs: Springs  # nonlinear
     factor: Tensor  # on the springs' stiffness, of all or of each (E,)
+    spring_damping: Tensor | float = 0.0  # of the springs' lengths, over their stiffness [frames]
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -197,22 +200,26 @@ class ModalScene:
 
             M (z_{t+1} - 2 z_t + z_{t-1}) = f(m_-, m_+) - K (m_- + m_+) / 2 - D (z_{t+1} - z_{t-1}) / 2 + load
 
-        Without damping and load it conserves :meth:`energy` exactly. It is solved by corrections with the stiffness at
-        z_t; loss gradients are those of the corrections.
+        The springs' damping is part of f. Without damping and load a step conserves :meth:`energy` exactly. It is
+        solved by corrections; loss gradients are theirs.
         """
-        springs, factor = self.springs, self.factor
+        springs, factor, damping = self.springs, self.factor, self.spring_damping
         speed, bend = z - previous, torch.zeros_like(z)
         taut, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
         if load is not None:
             taut, force = springs.strained(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        with torch.no_grad():
-            operator = linear + springs.stiffening(springs.stretched(z, taut), factor) / 4
-            inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
-        first = springs.stretched(z - speed / 2, taut)
-        for _ in range(CORRECTIONS):
-            nonlinear = springs.between(first, springs.stretched(z + (speed + bend) / 2, taut), factor)
+        first, now, second = (springs.stretched(z + part * speed / 2, taut) for part in (-1, 0, 1))
+        ends = now, now
+        for correction in range(CORRECTIONS):
+            if correction < ASSEMBLED:
+                with torch.no_grad():
+                    operator = linear + springs.stiffening(*ends, factor, damping) / 4
+                    inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
+            nonlinear = springs.between(first, second, factor, damping)
             bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
+            second = springs.stretched(z + (speed + bend) / 2, taut)
+            ends = first, second
         return z + speed + bend
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
@@ -225,10 +232,14 @@ class ModalScene:
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
         return energy + self.springs.potential(self.springs.stretched(middle), factor)
 
-    def dissipated(self, after: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """Energy lost to damping in a step, v^T D v of v = (z_{t+1} - z_{t-1}) / 2."""
-        speed = (after - previous) / 2
-        return ((speed @ self.damping) * speed).sum(-1)
+    def dissipated(
+        self, after: Float[Tensor, "S M"], now: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]
+    ) -> Float[Tensor, " S"]:
+        """Energy lost to damping in a step: v^T D v of v = (z_{t+1} - z_{t-1}) / 2, and what the springs' takes."""
+        speed, springs = (after - previous) / 2, self.springs
+        first, second = (springs.stretched((now + end) / 2) for end in (previous, after))
+        taken = springs.dissipated(first, second, self.factor, self.spring_damping)
+        return ((speed @ self.damping) * speed).sum(-1) + taken
 
 
 def force_of_strain(
@@ -298,20 +309,18 @@ class PreparedScenes(PreparedTemplate):
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
-        return self._of_members(motion, ModalScene.energy)
+        return self._by_member([part.energy(*z) for part, z in self._coordinates(motion)])
 
-    def dissipated(self, motion: Motion) -> Float[Tensor, " S"]:
-        """Energy that the damping takes from every member in a step; ``motion`` is at t + 1 and t - 1."""
-        return self._of_members(motion, ModalScene.dissipated)
+    def dissipated(self, motion: Motion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
+        """Energy that the damping takes from every member in a step from ``previous`` to the end of ``motion``."""
+        earlier = self._coordinates(replace(motion, before=previous))
+        found = zip(self._coordinates(motion), earlier, strict=True)
+        return self._by_member([part.dissipated(*z, before) for (part, z), (_, (_, before)) in found])
 
-    def _of_members(
-        self, motion: Motion, figure: Callable[[ModalScene, Tensor, Tensor], Tensor]
-    ) -> Float[Tensor, " S"]:
-        found = [
-            figure(part, *part.coordinates(*self._displacements(motion, rows, members)))
-            for part, rows, members in self.parts
+    def _coordinates(self, motion: Motion) -> list[tuple[ModalScene, tuple[Tensor, Tensor]]]:
+        return [
+            (part, part.coordinates(*self._displacements(motion, rows, members))) for part, rows, members in self.parts
         ]
-        return self._by_member(found)
 
     def correction_unit(self) -> Float[Tensor, " S"] | None:
         """Factor on the network's output of every member of the batch; None for a factor of 1."""
