@@ -259,6 +259,42 @@ def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia(neural, 
     assert max(energies[0]) < 1.01 * energies[0][0] and energies[1][-1] == pytest.approx(energies[1][0], rel=1e-9)
 
 
+@torch.no_grad()
+def test_forces_move_fast_modes_as_far_as_they_should(neural) -> None:
+    """A force of one frame swings every linear mode by v sin(w t) / w; a steady one ends where K z = M a."""
+    model = neural(lever=0.0, output_scale=0.0)
+    batch, scene = model.batch((0,)), model.scenes[0]
+    prepared = model.prepare(batch)
+    part = prepared.template.parts[0][0]
+    part.factor, damping = torch.zeros_like(part.factor), part.damping
+    part.stiffness = 20 * part.stiffness
+    speed = 0.01 * torch.randn(9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    accelerations = (part.positions @ speed).view(-1, 3)[batch.finest[batch.simulated]] @ prepared.frames.axes[-1][0]
+    force = torch.zeros_like(scene.means)
+    force[scene.simulated] = prepared.mass[:, None] * accelerations / batch.dt**2
+
+    def rollout(frames: int, pushed: int) -> torch.Tensor:
+        state, found = SimState(scene.means, scene.means), []
+        for frame in range(frames):
+            made = model.step(batch, state, force if frame < pushed else None, prepared)
+            state = SimState(made.positions, state.positions)
+            change = (prepared.finest(state.positions) - prepared.levels[-1].rest)[None]
+            found.append(part.coordinates(change, change)[0][0])
+        return torch.stack(found)
+
+    part.damping = torch.zeros_like(damping)
+    lower = torch.linalg.cholesky(part.inertia)
+    inverse = torch.linalg.inv(lower)
+    squares, modes = torch.linalg.eigh(inverse @ part.stiffness @ inverse.mT)
+    assert float(squares[-1]) > 100
+    swings, velocities = (z @ lower @ modes for z in (rollout(20, 1), speed))
+    turns = 2 * torch.atan(squares.sqrt() / 2) * torch.arange(1, 21)[:, None]
+    torch.testing.assert_close(swings, velocities / squares.sqrt() * torch.sin(turns), atol=1e-5, rtol=1e-3)
+    part.damping = 0.2 * (part.inertia + part.stiffness / 4)
+    still = torch.linalg.solve(part.stiffness, part.inertia @ speed)
+    torch.testing.assert_close(rollout(150, 150)[-1], still, atol=1e-6, rtol=1e-3)
+
+
 def test_springs_start_from_the_lengths_of_a_strained_reference(neural) -> None:
     """With D the displacement gradient of the reference at the units, a spring is d_0 + D d_0 + Psi z."""
     model = neural()

@@ -94,6 +94,10 @@ class Reference(ABC):
     def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
         """Deformation gradients and rotations of all rows of a step where the bodies have their rest shape."""
 
+    def turned(self, state: SimState) -> Float[Tensor, "N 3 3"] | None:
+        """Rotation of the undeformed body of every finest unit in a state of the kernels; None where nothing moves."""
+        return None
+
     @abstractmethod
     def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
         """A state of the kernels relative to the reference."""
@@ -145,14 +149,19 @@ class MovingReference(Reference):
 
     def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
         """Rotations of the bodies; identities for kernels that never move."""
-        parts = []
-        for member, body in zip(self._members, self._bodies, strict=True):
-            rotation = torch.eye(3).to(state.positions).repeat(member.units.stop - member.units.start, 1, 1)
-            if body is not None:
-                rotation[:-1] = body.turned(SimState(state.positions[member.kernels], state.previous[member.kernels]))
-            parts.append(rotation)
-        whole = torch.cat(parts)
+        turned, still = self.turned(state), torch.eye(3).to(state.positions)[None]
+        whole = torch.cat([part for span in self._spans for part in (turned[span], still)])
         return whole, whole
+
+    def turned(self, state: SimState) -> Float[Tensor, "N 3 3"]:
+        """Rotation of the undeformed body of every finest unit in a state of the kernels."""
+        parts = []
+        for member, span, body in zip(self._members, self._spans, self._bodies, strict=True):
+            rotation = torch.eye(3).to(state.positions)
+            if body is not None:
+                rotation = body.turned(SimState(state.positions[member.kernels], state.previous[member.kernels]))
+            parts.append(rotation.expand(span.stop - span.start, 3, 3))
+        return torch.cat(parts)
 
     def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
         """A state of the kernels relative to the references."""

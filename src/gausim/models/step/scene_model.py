@@ -160,11 +160,19 @@ class SceneModel(nn.Module, ABC):
         return fraction[:, None, None] * projection.index_select(0, batch.finest)
 
     def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
-        """The state with free kernels displaced by a force: x_t + f dt^2 / (2 m)."""
+        """The state after a force on free kernels has acted on it for a frame.
+
+        The paper's is x_t + f dt^2 / (2 m). In templates with modes x_{t-1} gives the same velocity, f dt / m, less
+        what is withheld from it within the frame (:meth:`gausim.models.template.template.ModalScene.withheld`).
+        """
         batch = prepared.batch
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
-        shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
-        return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
+        shift = shift.masked_fill(batch.pinned[:, None], 0.0)
+        withheld = prepared.withheld(state, 2 * shift)
+        if withheld is None:
+            return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
+        gained = (2 * shift - withheld).masked_fill(batch.pinned[:, None], 0.0)
+        return SimState(state.positions, state.previous.index_add(0, batch.simulated, gained, alpha=-1))
 
     @property
     def knows_energy(self) -> bool:

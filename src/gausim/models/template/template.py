@@ -30,6 +30,8 @@ MIN_DETERMINANT = 0.2
 # the state at the beginning. It misses how far springs turn within the frame: where they are far stiffer than inertia,
 # corrections with it alone do not converge. With the second, between the ends of the frame, they do.
 CORRECTIONS, ASSEMBLED = 3, 2
+# Least part of an impulse that damping leaves in its first frame.
+LEAST_LEFT = 0.1
 DENSITY = "density over that at the beginning of training"
 
 
@@ -83,6 +85,10 @@ class PreparedTemplate:
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network; here all of it."""
         return motion
+
+    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"] | None:
+        """What stiffness withholds from a displacement by an impulse within a frame; None for a template without."""
+        return None
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch.
@@ -222,6 +228,21 @@ class ModalScene:
             ends = first, second
         return z + speed + bend
 
+    def withheld(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+        """Z less (M + K / 4)^-1 M z / (1 - t), of the modal coordinates z of a displacement by an impulse in a frame.
+
+        A mode of angular frequency w that gets a velocity v thus begins with v / (1 + w^2 / 4), with which a motion of
+        the trapezoidal rule is as large as the true one, v / w. With all of v modes far above the frame rate would turn
+        round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
+        steady force ends where stiffness balances it.
+        """
+        whole = self.inertia + self.stiffness / 4
+        inverse, slow = (torch.linalg.inv_ex(a)[0] for a in (whole, self.stiffness))  # without waiting for a device
+        lost = (slow * self.damping).sum() / (2 * (slow * whole).sum())
+        z = (displacement.flatten(1) @ self.projection).mT
+        held = z - inverse @ self.inertia @ z / (1 - lost).clamp_min(LEAST_LEFT)
+        return (held.mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
+
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """v^T M v / 2 + m^T K m / 2 + the springs' nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
 
@@ -306,6 +327,14 @@ class PreparedScenes(PreparedTemplate):
             made.append(torch.stack([x.flatten(0, 1) for x in part.carried(both).chunk(2)]))
         seen = made[0] if len(made) == 1 else torch.cat(made, 1).index_select(1, self._places)
         return Motion(motion.rest, motion.rest + seen[0], motion.rest + seen[1])
+
+    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """What stiffness withholds from a displacement by an impulse within a frame, scene by scene."""
+        made = []
+        for part, rows, members in self.parts:
+            own = displacement.index_select(0, rows).view(len(members), -1, 3)
+            made.append(part.withheld(own).flatten(0, 1))
+        return torch.cat(made).index_select(0, self._places)
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
