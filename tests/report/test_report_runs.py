@@ -87,11 +87,14 @@ def test_variations_stand_in_the_papers_order_whatever_their_directories_are_cal
     varied = {
         "a": config(**report_runs.NO_HIERARCHY), "b": config(conserve_mass=False, conserve_momentum=False),
         "c": config(conserve_momentum=False), "d": config(conserve_mass=False), "e": config(),
+        "f": config(head={"output_scale": 0.0, "lever": 0.0}),
     }  # fmt: skip
     for name, settings in varied.items():
         write_run(tmp_path / name, settings, finished=False)
     found = [g.variation for g in make_study(find_runs([tmp_path])).groups]
-    assert found == ["full", "w/o mass", "w/o mass, w/o momentum", "w/o momentum", "w/o hierarchy"]
+    assert found == [
+        "full", "w/o network", "w/o mass", "w/o mass, w/o momentum", "w/o momentum", "w/o hierarchy",
+    ]  # fmt: skip
 
 
 def test_old_configurations_are_read_by_present_names(tmp_path):

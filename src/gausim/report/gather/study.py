@@ -19,7 +19,7 @@ NOT_MEASURED = "not measured"
 # Settings that select the object of a run.
 _WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections", "data.test")
 # The paper's order of rows and columns; others follow.
-_ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
+_ORDER = ("jointly", "w/o network", "w/o mass", "w/o momentum", "w/o hierarchy")
 # Largest number of differing settings in a row's name.
 _KEYS_IN_NAMES = 3
 # States of runs without a number, in the order of precedence.
@@ -191,7 +191,7 @@ def _data(run: RunRecord) -> tuple[Any, Any]:
     return (data.get("names"), data.get("root", "?")) if isinstance(data, dict) else (None, "?")
 
 
-_SWITCHES = ("no_mass", "no_momentum", "no_hierarchy")  # ablations that are identified by the settings
+_SWITCHES = ("no_network", "no_mass", "no_momentum", "no_hierarchy")  # ablations that are identified by the settings
 
 
 def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
@@ -200,7 +200,9 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     family = run.choices.get("model") or str(run.config.get("name") or run.name)
     levels = dig(simulator, "hierarchy", "levels")
     is_flat = isinstance(levels, list) and len(levels) == 1 and dig(levels[0], "diameter") == 0
+    head = dig(simulator, "head")
     off = [word for word, is_off in (
+        ("w/o network", dig(head, "output_scale") == 0 and dig(head, "lever") == 0),
         ("w/o mass", dig(simulator, "conserve_mass") is False),
         ("w/o momentum", dig(simulator, "conserve_momentum") is False),
         ("w/o hierarchy", is_flat),
