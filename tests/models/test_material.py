@@ -266,7 +266,7 @@ def test_forces_move_fast_modes_as_far_as_they_should(neural) -> None:
     batch, scene = model.batch((0,)), model.scenes[0]
     prepared = model.prepare(batch)
     part = prepared.template.parts[0][0]
-    part.factor, damping = torch.zeros_like(part.factor), part.damping
+    part.factor, part.damping = torch.zeros_like(part.factor), torch.zeros_like(part.damping)
     part.stiffness = 20 * part.stiffness
     speed = 0.01 * torch.randn(9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     accelerations = (part.positions @ speed).view(-1, 3)[batch.finest[batch.simulated]] @ prepared.frames.axes[-1][0]
@@ -282,7 +282,6 @@ def test_forces_move_fast_modes_as_far_as_they_should(neural) -> None:
             found.append(part.coordinates(change, change)[0][0])
         return torch.stack(found)
 
-    part.damping = torch.zeros_like(damping)
     lower = torch.linalg.cholesky(part.inertia)
     inverse = torch.linalg.inv(lower)
     squares, modes = torch.linalg.eigh(inverse @ part.stiffness @ inverse.mT)

@@ -66,18 +66,15 @@ class Prepared:
     def _in_body_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return positions if self.frames is None else self.frames.into(len(self.levels) - 1, positions)
 
-    def withheld(self, state: SimState, displacement: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"] | None:
-        """What is withheld from a displacement of the simulated kernels by an impulse; None without modes."""
+    def withheld(self, state: SimState, displacement: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
+        """The part of a displacement of the simulated kernels by an impulse that its frame does not reach."""
         batch, turned = self.batch, self.reference.turned(state)
+        axes = None if self.frames is None else self.frames.axes[-1]  # those of the template
+        if turned is not None:
+            axes = turned.mT if axes is None else axes @ turned.mT
         own = self.aggregate(torch.zeros_like(state.positions).index_copy(0, batch.simulated, displacement))
-        back = [axes for axes in (turned, None if self.frames is None else self.frames.axes[-1].mT) if axes is not None]
-        for axes in back:
-            own = apply(axes.mT, own)
-        found = self.template.withheld(own)
-        if found is None:
-            return None
-        for axes in reversed(back):
-            found = apply(axes, found)
+        found = self.template.withheld(own if axes is None else apply(axes, own))
+        found = found if axes is None else apply(axes.mT, found)
         return found.index_select(0, batch.finest.index_select(0, batch.simulated))
 
     def per_level(self, finest: Float[Tensor, "N C"]) -> list[Tensor]:

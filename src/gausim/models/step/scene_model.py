@@ -168,10 +168,9 @@ class SceneModel(nn.Module, ABC):
         batch = prepared.batch
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
         shift = shift.masked_fill(batch.pinned[:, None], 0.0)
-        withheld = prepared.withheld(state, 2 * shift)
-        if withheld is None:
+        if not self.knows_energy:
             return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
-        gained = (2 * shift - withheld).masked_fill(batch.pinned[:, None], 0.0)
+        gained = (2 * shift - prepared.withheld(state, 2 * shift)).masked_fill(batch.pinned[:, None], 0.0)
         return SimState(state.positions, state.previous.index_add(0, batch.simulated, gained, alpha=-1))
 
     @property

@@ -160,7 +160,7 @@ class Matrices:
     between: Float[Tensor, " E"]  # mass of every link in units of T_ij
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
     tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
-    link_damping: Tensor | float = 0.0  # of the nonlinear links' lengths, over their stiffness
+    link_damping: Tensor | float  # of the nonlinear links' lengths, over their stiffness
 
 
 class MaterialTemplate(Template):
@@ -264,8 +264,9 @@ class MaterialTemplate(Template):
         damping = dragged + (dragged.trace() / inertia.trace() / 4 + viscosity / frame) * k * stiffness
         uneven = k * (units[:, :2].exp() - 1)
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
-        slow = self.links.damping / frame
-        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven, tense, slow)
+        return Matrices(
+            k * stiffness, inertia, damping, k * springs, density, between, uneven, tense, self.links.damping / frame
+        )
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, damping and density of the units as they enter K, D and M.

@@ -86,7 +86,7 @@ class Springs(nn.Module):
         """Twice the negative derivative of :meth:`between` with respect to z of the second state.
 
         With d and l the means of both springs and of both lengths, n_0 and n the directions at rest and in the second
-        state, t = (tension over stiffness) / l and |d_0| the length at rest, a spring contributes k times
+        state, and t = (tension over stiffness) / l, a spring contributes k times
 
             ((1 + 2 damping) / l - t / l) d n^T + t I - n_0 n_0^T
 

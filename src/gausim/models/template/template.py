@@ -86,9 +86,13 @@ class PreparedTemplate:
         """The part of the motion that is input to template and network; here all of it."""
         return motion
 
-    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"] | None:
-        """What stiffness withholds from a displacement by an impulse within a frame; None for a template without."""
-        return None
+    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The part of a displacement by an impulse that its frame does not reach (:meth:`ModalScene.withheld`).
+
+        Raises:
+            NotImplementedError: the template has no energy.
+        """
+        raise NotImplementedError("the rest state has no energy")
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch.
@@ -215,22 +219,22 @@ class ModalScene:
         if load is not None:
             taut, force = springs.strained(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first, now, second = (springs.stretched(z + part * speed / 2, taut) for part in (-1, 0, 1))
-        ends = now, now
+        first, now = springs.stretched(z - speed / 2, taut), springs.stretched(z, taut)
         for correction in range(CORRECTIONS):
+            second = springs.stretched(z + (speed + bend) / 2, taut)
             if correction < ASSEMBLED:
                 with torch.no_grad():
+                    ends = (first, second) if correction else (now, now)
                     operator = linear + springs.stiffening(*ends, factor, damping) / 4
                     inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
             nonlinear = springs.between(first, second, factor, damping)
             bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
-            second = springs.stretched(z + (speed + bend) / 2, taut)
-            ends = first, second
         return z + speed + bend
 
     def withheld(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """Z less (M + K / 4)^-1 M z / (1 - t), of the modal coordinates z of a displacement by an impulse in a frame.
+        """The part of a displacement by an impulse that its frame does not reach.
 
+        Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t).
         A mode of angular frequency w that gets a velocity v thus begins with v / (1 + w^2 / 4), with which a motion of
         the trapezoidal rule is as large as the true one, v / w. With all of v modes far above the frame rate would turn
         round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
@@ -307,7 +311,7 @@ class PreparedScenes(PreparedTemplate):
         for part, rows, members in self.parts:
             own = None if load is None else load.index_select(0, rows).view(len(members), -1, 12)
             made.append(part(*self._displacements(motion, rows, members), own).flatten(0, 1))
-        moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
+        moved = self._in_order(made)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], deformation)
@@ -329,12 +333,16 @@ class PreparedScenes(PreparedTemplate):
         return Motion(motion.rest, motion.rest + seen[0], motion.rest + seen[1])
 
     def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """What stiffness withholds from a displacement by an impulse within a frame, scene by scene."""
+        """The part of a displacement by an impulse that its frame does not reach, scene by scene."""
         made = []
         for part, rows, members in self.parts:
             own = displacement.index_select(0, rows).view(len(members), -1, 3)
             made.append(part.withheld(own).flatten(0, 1))
-        return torch.cat(made).index_select(0, self._places)
+        return self._in_order(made)
+
+    def _in_order(self, made: list[Tensor]) -> Tensor:
+        """Values of the units, scene by scene, in the order of the batch."""
+        return made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
