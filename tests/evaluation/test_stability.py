@@ -46,14 +46,18 @@ def test_it_is_the_growth_of_a_small_motion(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(stability, "DENSE", 0)
     assert stability.largest_eigenvalue(model, 0) == pytest.approx(found, abs=1e-4)
     model.eval()
-    state = SimState(batch.rest, batch.rest + 1e-4 * torch.randn(batch.rest.shape))
+    draw = torch.randn(batch.rest.shape, generator=torch.Generator().manual_seed(0))
+    state = SimState(batch.rest, batch.rest + 1e-4 * draw)
     logs, small = [], 1e-4
     with torch.no_grad():
-        for _ in range(160):
+        for _ in range(300):
             after = model.step(batch, state).positions
             factor = small / float(torch.stack((after - batch.rest, state.positions - batch.rest)).abs().max())
             state = SimState(
                 batch.rest + factor * (after - batch.rest), batch.rest + factor * (state.positions - batch.rest)
             )
             logs.append(-torch.tensor(factor).log())
-    assert float(torch.stack(logs[60:]).mean().exp()) == pytest.approx(found, abs=5e-3)
+    # The motion turns as it grows, so a mean with equal weights depends on where in a turn it begins and ends.
+    weights = torch.hann_window(240, periodic=False)
+    mean = (torch.stack(logs[60:]) * weights).sum() / weights.sum()
+    assert float(mean.exp()) == pytest.approx(found, abs=5e-3)
