@@ -30,11 +30,11 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_toy_object(tmp_path_factory.mktemp("warm") / "toy", frames=8).root
 
 
-@pytest.mark.parametrize("model", ["gausim", "gausim_elastic"])
+@pytest.mark.parametrize("choice", [["model=gausim"], ["model=gausim_elastic"], ["model=gausim", "supervision=points"]])
 def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_checkpoint(
-    toy: Path, tmp_path: Path, model: str, capsys: pytest.CaptureFixture[str]
+    toy: Path, tmp_path: Path, choice: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    common = [f"data.root={toy}", f"model={model}", *QUICK, "+callbacks.warm_start.updates=60"]
+    common = [f"data.root={toy}", *choice, *QUICK, "+callbacks.warm_start.updates=60"]
     assert train.main([*common, "trainer.max_epochs=2", f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
     printed = capsys.readouterr().out
     assert "warm start: 2 sequences tracked" in printed

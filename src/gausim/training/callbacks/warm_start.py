@@ -2,8 +2,9 @@
 
 Rollouts from a state and a material at random do not resemble the videos, and images that do not overlap have no useful
 loss gradient. So the motion of every sequence is tracked without dynamics, in the modes of the template
-(:mod:`gausim.training.supervision.motion_tracker`), and initial states, densities, attributes and the template are
-fitted to it in modal coordinates (:mod:`gausim.training.modal_fit`). Training then starts from there, with the network.
+(:mod:`gausim.training.supervision.motion_tracker`), or taken from true points, and initial states, densities,
+attributes and the template are fitted to it in modal coordinates (:mod:`gausim.training.modal_fit`). Training then
+starts from there, with the network.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from gausim.training.callbacks.cadence import training_data
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
-from gausim.training.supervision.images import ImageSupervision, Sources
+from gausim.training.supervision.images import Sources
 from gausim.training.supervision.motion_tracks import TrackSupervision
+from gausim.training.supervision.points import PointSupervision
 
 # Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
 Tracked = list[tuple[SequenceSample, Tensor]]
@@ -36,8 +38,8 @@ Tracked = list[tuple[SequenceSample, Tensor]]
 class WarmStart(Callback):
     """Tracks the motion of all training sequences and fits initial states and material to it, before the first step.
 
-    It has no effect on models without modes, where bodies are free or above a floor, on supervision by true points, and
-    on runs that are resumed.
+    It has no effect on models without modes, where bodies are free or above a floor, on supervision by true points of
+    bodies in hands, and on runs that are resumed.
     """
 
     def __init__(
@@ -110,7 +112,7 @@ class WarmStart(Callback):
     def _fit(self, module: GausSimModule, data: ReadyDataModule, groups: Any, *, quiet: bool) -> None:
         model, last = cast(GausSim, module.model), data.curriculum.longest
         tracks, states = module.supervision, cast(InitialStates, module.initial_states)
-        if not isinstance(tracks, TrackSupervision):
+        if not isinstance(tracks, PointSupervision):
             motions_of, image, references = model.smooth_motions, module.objective.image, module.method.references
             sources = Sources(model.scenes, lambda number: None, motions_of, module.renderer, image, references)
             tracks = TrackSupervision(sources)
@@ -158,7 +160,7 @@ def _can_be_tracked(module: GausSimModule, data: ReadyDataModule) -> bool:
     model = module.model
     if not isinstance(model, GausSim) or not isinstance(module.initial_states, InitialStates):
         return False
-    if not isinstance(module.supervision, (ImageSupervision, TrackSupervision)):
+    if type(module.supervision) is PointSupervision and any(map(module.method.hands, range(len(data.index.entries)))):
         return False
     alone = all(not scene.surroundings.free and scene.surroundings.floor is None for scene in model.scenes)
     return alone and all(model.template.basis(i) is not None for i in range(len(model.scenes)))

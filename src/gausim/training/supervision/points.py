@@ -29,8 +29,7 @@ MOST_KNOWN = 256
 def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
     """Nearest simulated kernel of every rest-space point; the point moves with that kernel's unit."""
     candidates = scene.simulated.nonzero()[:, 0]
-    chunks = points.to(scene.means).split(1024)
-    return torch.cat([candidates[torch.cdist(p, scene.means[candidates]).argmin(1)] for p in chunks])
+    return candidates[_nearest(points.to(scene.means), scene.means[candidates])]
 
 
 class PointSupervision:
@@ -84,6 +83,12 @@ class PointSupervision:
 
     def _least(self, sample: SequenceSample) -> float:
         return (LEAST_SWING * self._scenes[sample.scene_id].diagonal) ** 2
+
+    def displacements(self, sample: SequenceSample) -> Float[Tensor, "F K 3"]:
+        """Displacements of all kernels from rest, each that of its nearest point, frame 0 first [scene units]."""
+        truth = self.motion(sample)
+        moved = truth.positions[sample.start : sample.start + sample.steps + 1] - truth.rest
+        return moved[:, _nearest(self._scenes[sample.scene_id].means.to(truth.rest), truth.rest)]
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
         """True motion of a sample's sequence in all frames; raises DataError where it is unknown."""
@@ -154,6 +159,10 @@ def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Fl
 def _distance(squares: Float[Tensor, " T"]) -> Float[Tensor, " T"]:
     """Root of squared errors, with a finite derivative at zero."""
     return (squares + LEAST_ERROR**2).sqrt() - LEAST_ERROR
+
+
+def _nearest(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"]) -> Int[Tensor, " P"]:
+    return torch.cat([torch.cdist(part, others).argmin(1) for part in points.split(1024)])
 
 
 def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
