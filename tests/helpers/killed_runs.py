@@ -32,12 +32,12 @@ from gausim.cli.main import main
 from gausim.training.module import GausSimModule
 
 
-def die_at(target: str, match: str, count: int, when: str, rank: int = 0) -> None:
-    """Ends a rank by SIGKILL before or after our count-th call of ``target`` with ``match`` in its arguments."""
+def die_at(target: str, match: str, count: int, when: str, rank: int = 0, by: str = "SIGKILL") -> None:
+    """Ends a rank by a signal before or after our count-th call of ``target`` with ``match`` in its arguments."""
 
     def kill() -> None:
         others = sorted(multiprocessing.active_children(), key=lambda process: process.pid)
-        os.kill(others[rank - 1].pid if rank else os.getpid(), signal.SIGKILL)
+        os.kill(others[rank - 1].pid if rank else os.getpid(), signal.Signals[by])
 
     home, name = target.rsplit(".", 1)
     try:

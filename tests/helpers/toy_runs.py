@@ -125,9 +125,9 @@ def rows(path: Path) -> list[dict[str, str]]:
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
-def killed(target: str, count: int, match: str = "", when: str = "before", rank: int = 0) -> dict[str, Any]:
-    """A death at the count-th call of a function with ``match`` in its arguments, on one of the ranks."""
-    return {"die": [{"target": target, "match": match, "count": count, "when": when, "rank": rank}]}
+def killed(target: str, count: int, **how: Any) -> dict[str, Any]:
+    """A death at the count-th call of a function; ``how`` are the other arguments of ``killed_runs.die_at``."""
+    return {"die": [{"target": target, "match": "", "count": count, "when": "before", **how}]}
 
 
 def learned(run: Path) -> dict[str, str]:

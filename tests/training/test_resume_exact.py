@@ -34,6 +34,10 @@ def test_a_run_killed_while_it_saves_equals_an_uninterrupted_one(trainings: Trai
     assert_same_run(run, toy_run)
 
 
+def test_a_run_that_is_asked_to_end_does_so_at_once(trainings: Trainings) -> None:
+    assert trainings("asked", *THREE, **killed(STEP, 2, by="SIGTERM"))[0] == -15
+
+
 @pytest.mark.slow
 def test_a_run_killed_again_and_again_equals_an_uninterrupted_one(trainings: Trainings, toy_run: Path) -> None:
     run = trainings.run("often")
