@@ -10,6 +10,7 @@ from helpers.toy_object import toy_scene
 
 from gausim.compose.config import instantiate
 from gausim.core import RunError
+from gausim.losses.objective import EnergyLoss
 from gausim.runs.directory import CONFIG, RunDirectory
 from gausim.runs.renamed import ELASTIC, MOVED, with_present_names, with_present_weights
 from gausim.training.trainer import TrainerSettings
@@ -27,7 +28,9 @@ OLD = {
             "passive_frames": 4, "conserve_mass": False, "edge_bucket": 16,
         }
     },
-    "loss": {"_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0},
+    "loss": {
+        "_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0, "energy_weight": 3.0,
+    },
     "optimizer": {"schedule": {"_target_": "gausim.engine.optim.CosineSchedule", "warmup": 0.02}},
     "trainer": {"_target_": "gausim.training.trainer.make_trainer", "max_epochs": 3, "devices": 2},
     "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
@@ -40,7 +43,8 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
     assert [c["_target_"] for c in found["callbacks"]] == [
         "gausim.training.callbacks.progress.Progress", "torch.nn.Module",
     ]  # fmt: skip
-    assert instantiate(found["loss"]).static_weight == 2.0
+    loss = instantiate(found["loss"])
+    assert loss.static_weight == 2.0 and loss.energy == EnergyLoss(weight=3.0)
     assert found["optimizer"] == {"schedule": None}
     assert instantiate(found["trainer"]) == TrainerSettings(devices=2, max_epochs=3)
     simulator = found["model"]["simulator"]
@@ -49,8 +53,8 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
         {"diameter": 0.5, "edge_length": 2.0}, {"diameter": 0.2, "edge_length": 0.4},
     ]  # fmt: skip
     assert simulator["head"]["lever"] == 0.1 and simulator["rollout"]["energy_guard_frames"] == 4
-    loss = {"_target_": "gausim.losses.image.ImageLoss", "window": 7}
-    assert with_present_names(loss | {"crop": True}) == loss
+    image = {"_target_": "gausim.losses.image.ImageLoss", "window": 7}
+    assert with_present_names(image | {"crop": True}) == image
     model = instantiate(simulator, scenes=[toy_scene()], fps=[24.0])()
     assert model.predicted_levels == (2, 1)
     assert with_present_names(found) == found

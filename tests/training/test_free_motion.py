@@ -12,7 +12,7 @@ from helpers import sway
 from torch import Tensor
 
 from gausim.core import ConfigError, SimState
-from gausim.losses import Objective
+from gausim.losses.objective import EnergyLoss, Objective
 from gausim.models.template.template import RestTemplate, Template
 from gausim.training.graphed import GraphedRollouts
 from gausim.training.module import GausSimModule
@@ -78,7 +78,7 @@ def _module(objective: Objective, template: Callable[..., Template], scenes: Seq
 def test_training_carries_it_as_often_as_asked_and_repeats_itself() -> None:
     seen, grads = [], []
     for weight, chance in ((1.0, 1.0), (1.0, 1.0), (0.0, 1.0), (1.0, 0.0)):
-        objective = Objective(energy_weight=weight, energy_probability=chance, energy_frames=8, energy_stretch=4)
+        objective = Objective(energy=EnergyLoss(weight=weight, probability=chance, frames=8, stretch=4))
         module = _module(objective, ELASTIC)
         stats = module.optimise([sample(0)], module.configure_optimizers(), torch.Generator().manual_seed(3))
         seen.append("energy_growth" in stats)
@@ -101,10 +101,10 @@ def test_members_of_several_scenes_have_their_own_energies() -> None:
 
 
 def test_models_and_templates_without_energy_are_refused_and_null_asks_those_that_have_one() -> None:
-    asked = Objective(energy_weight=1.0)
-    with pytest.raises(ConfigError, match=r"energy_weight is 1.0, but Sway knows no energy"):
+    asked = Objective(energy=EnergyLoss(weight=1.0))
+    with pytest.raises(ConfigError, match=r"energy.weight is 1.0, but Sway knows no energy"):
         sway_module(objective=asked)
-    with pytest.raises(ConfigError, match=r"energy_weight is 1.0, but RestTemplate knows no energy"):
+    with pytest.raises(ConfigError, match=r"energy.weight is 1.0, but RestTemplate knows no energy"):
         _module(asked, RestTemplate)
-    either = Objective(energy_weight=None)
+    either = Objective(energy=EnergyLoss(weight=None))
     assert [_module(either, template).free_motion.weight for template in (RestTemplate, ELASTIC)] == [0.0, 1.0]

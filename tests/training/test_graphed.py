@@ -11,7 +11,7 @@ from helpers.meta_device import asking_nothing
 from helpers.sway import ELASTIC, blobs, real_module, sample
 from torch import Tensor, nn
 
-from gausim.losses.objective import Objective
+from gausim.losses.objective import EnergyLoss, Objective
 from gausim.models.settings import RolloutSettings
 from gausim.models.template.material import MaterialTemplate
 from gausim.models.template.template import RestTemplate
@@ -20,7 +20,7 @@ from gausim.training.module import GausSimModule
 
 # Every batch has free motion, where a template knows its energy.
 OBJECTIVE = Objective(
-    static_weight=0.0, backprop_steps=0, energy_weight=None, energy_probability=1.0, energy_frames=6, energy_stretch=2
+    static_weight=0.0, backprop_steps=0, energy=EnergyLoss(weight=None, probability=1.0, frames=6, stretch=2)
 )
 MATERIAL = partial(MaterialTemplate, modes=6)
 TEMPLATES = pytest.mark.parametrize("template", [RestTemplate, ELASTIC, MATERIAL])

@@ -9,6 +9,32 @@ from gausim.losses.image import ImageLoss
 
 
 @dataclass(frozen=True)
+class EnergyLoss:
+    """Loss on energy that free motion gains beyond the training frames.
+
+    Attributes:
+        weight: weight of the relative growth, times the batch's image loss; 0 is off. It needs a template with an
+            energy; None is 1 with one, else 0.
+        frames: number of frames of that motion.
+        stretch: frames over which its energy is averaged, about a period; loss gradients stop at its ends.
+        probability: probability of this term in a batch.
+    """
+
+    weight: float | None = 0.0
+    frames: int = 36
+    stretch: int = 12
+    probability: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        if (self.weight or 0) < 0 or not 0 <= self.probability <= 1 or not 0 < self.stretch < self.frames:
+            raise ConfigError(
+                "loss.energy: expected weight >= 0 or null, 0 <= probability <= 1 and 0 < stretch < frames, got "
+                f"{self.weight}, {self.probability}, {self.stretch} and {self.frames}."
+            )
+
+
+@dataclass(frozen=True)
 class Objective:
     """Objective of an optimiser step (METHOD section 4).
 
@@ -24,11 +50,7 @@ class Objective:
         backprop_steps: loss gradients stop after this number of steps; 0 lets them through the whole rollout.
         checkpoint_steps: recompute each step in the backward pass from its input; same loss gradients in less memory,
             for about a third more time of the dynamics.
-        energy_weight: weight of the relative energy growth of free motion beyond the training frames, times the batch's
-            image loss; 0 is off. It needs a template with an energy; None is 1 with one, else 0.
-        energy_frames: number of frames of that motion.
-        energy_stretch: frames over which its energy is averaged, about a period; loss gradients stop at its ends.
-        energy_probability: probability of this term in a batch.
+        energy: the loss on energy gained by free motion.
         mixing_weight: weight of the penalty on mode mixing (squares of the template's mixing matrices), times the rest
             state's loss; it keeps the initial modes where the frames do not determine them.
         explosion: distance from rest of a kernel [diagonals of the scene's bounding box] at which a rollout ends, with
@@ -44,26 +66,18 @@ class Objective:
     over_steps: str = "mean"
     backprop_steps: int = 1
     checkpoint_steps: bool = False
-    energy_weight: float | None = 0.0
-    energy_frames: int = 36
-    energy_stretch: int = 12
-    energy_probability: float = 0.5
+    energy: EnergyLoss = field(default_factory=EnergyLoss)
     mixing_weight: float = 0.0
     explosion: float = 3.0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         names = ["backprop_steps", *(f.name for f in fields(self) if f.name.endswith("_weight"))]
-        negative = [name for name in names if (getattr(self, name) or 0) < 0]
+        negative = [name for name in names if getattr(self, name) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
         if self.over_steps not in ("mean", "sum"):
             raise ConfigError(f"loss.over_steps: expected mean or sum, got '{self.over_steps}'.")
-        if not 0 <= self.energy_probability <= 1 or not 0 < self.energy_stretch < self.energy_frames:
-            raise ConfigError(
-                "loss: expected 0 <= energy_probability <= 1 and 0 < energy_stretch < energy_frames, got "
-                f"{self.energy_probability}, {self.energy_stretch} and {self.energy_frames}."
-            )
         if self.static_probability is not None and not 0 <= self.static_probability <= 1:
             raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
 

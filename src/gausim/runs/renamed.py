@@ -88,7 +88,7 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
 # Removed settings of the elastic template with the supported value of each.
 ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
-# Settings of the material point method that are now in groups; plasticity was removed.
+# Settings that are now in groups; the plasticity of the material point method was removed.
 _MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
 _GRID = (
     "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
@@ -103,6 +103,12 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         ),
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
+    "gausim.losses.objective.Objective": {
+        "energy": (
+            "gausim.losses.objective.EnergyLoss",
+            ("energy_weight", "energy_frames", "energy_stretch", "energy_probability"),
+        ),
+    },
 }
 # Old prefixes of the weights of the predictor within the model.
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
@@ -130,7 +136,8 @@ def with_present_names(config: Any) -> Any:
             found["supervision"] = {"_target_": IMAGES, "_partial_": True}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
-        if found.get("_target_") in GROUPS and "discretisation" not in found:
+        groups = GROUPS.get(str(found.get("_target_")))
+        if groups is not None and not any(isinstance(found.get(group), dict) for group in groups):
             return _grouped(found)
         return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
@@ -152,7 +159,7 @@ def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a material point method in their groups."""
+    """Settings in their groups."""
     groups = GROUPS[old["_target_"]]
     if old.get("material", "fixed_corotated") != "fixed_corotated":
         raise ValueError(f"method.material is {old['material']!r}, which is no longer supported: fit the run again")

@@ -75,19 +75,19 @@ class FreeMotion:
     """
 
     def __init__(self, model: nn.Module, objective: Objective, graphs: GraphedRollouts) -> None:
-        knows, weight = bool(getattr(model, "knows_energy", False)), objective.energy_weight
+        knows, weight = bool(getattr(model, "knows_energy", False)), objective.energy.weight
         if weight and not knows:
             name = type(getattr(model, "template", model)).__name__
             raise ConfigError(
-                f"loss.energy_weight is {weight}, but {name} knows no energy. Use a template that does "
+                f"loss.energy.weight is {weight}, but {name} knows no energy. Use a template that does "
                 "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
             )
         self.weight = float(knows) if weight is None else float(weight)
-        self._model, self._objective, self._graphs = model, objective, graphs
+        self._model, self._settings, self._graphs = model, objective.energy, graphs
 
     def chosen(self, draws: torch.Generator) -> torch.Generator | None:
         """Draws whether this batch has the term; returns its random generator, or None."""
-        if self.weight == 0 or float(torch.rand((), generator=draws)) >= self._objective.energy_probability:
+        if self.weight == 0 or float(torch.rand((), generator=draws)) >= self._settings.probability:
             return None
         return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
 
@@ -105,7 +105,7 @@ class FreeMotion:
         The motion continues from ``state``; ``count`` is the number of the step's sequences over all ranks, and
         ``draws`` is the generator of :meth:`chosen`.
         """
-        frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
+        frames, stretch = self._settings.frames, self._settings.stretch
         total = losses.new_zeros(())
         for growth in energy_growth(self._model, batch, state, frames, stretch, draws, self._graphs):
             if growth.requires_grad:
