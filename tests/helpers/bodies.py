@@ -57,6 +57,11 @@ def make_model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0
     return model.eval()
 
 
+def neural_model(**options):
+    """A small model=gausim in double precision."""
+    return make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
+
+
 def make_state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimState:
     """Free kernels displaced at random in both frames."""
     generator = torch.Generator().manual_seed(100 + seed)

@@ -1,0 +1,216 @@
+"""The step of the modes and their springs: its solution, its energy, and how forces move it."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from helpers.bodies import neural_model, pull_of
+
+from gausim.core import SimState
+from gausim.models.template import template
+from gausim.models.template.material import DAMPING_GAIN, Links, MaterialTemplate
+from gausim.ops.quaternion import quaternion_to_matrix
+
+
+def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_order() -> None:
+    model = neural_model()
+    ((part, _, _),) = model.prepare(model.batch((0,))).template.parts
+    links = model.template.body(0).springs
+    springs, changes = part.matrices.links.detach() * links.stiffness, links.modes.unflatten(0, (-1, 3))
+    z = 0.05 * torch.randn(2, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def energy(z):
+        total = torch.zeros(len(z), dtype=torch.float64)
+        for e in range(len(springs)):
+            change = z @ changes[e].mT
+            length, now = links.offset[e].norm(), (links.offset[e] + change).norm(dim=-1)
+            total = total + 0.5 * springs[e] * ((now - length) ** 2 - (change @ links.offset[e] / length) ** 2)
+        return total
+
+    z.requires_grad_()
+    expected = energy(z)
+    torch.testing.assert_close(links.potential(links.stretched(z), part.matrices.links), expected)
+    (slope,) = torch.autograd.grad(expected.sum(), z)
+    torch.testing.assert_close(pull_of(links, z, part.matrices.links), -slope)
+    small, large = (pull_of(links, size * z).norm() for size in (1e-4, 1e-3))
+    assert float((small / large).detach()) == pytest.approx(0.01, rel=0.1)
+
+
+def test_the_step_solves_its_equation_with_the_slope_of_the_force() -> None:
+    model = neural_model()
+    ((part, _, _),) = model.prepare(model.batch((0,))).template.parts
+    springs, matrices = model.template.body(0).springs, part.matrices
+
+    def slope(factor):
+        at = torch.autograd.functional.jacobian(lambda q: pull_of(springs, q[None], factor)[0], z[0])
+        return -at.detach()
+
+    z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    ends = [springs.stretched(z)] * 2
+    least = torch.linalg.eigvalsh(springs.stiffening(*ends, matrices.links)[0] - slope(matrices.links))
+    assert least.min() > -1e-9 * least.max() and least.max() > 0  # compressed springs count as of their length
+    taut = (z @ springs.modes.mT).unflatten(-1, (-1, 3)) + springs.offset
+    only = (taut.norm(dim=-1)[0] > springs.length).double() * matrices.links
+    torch.testing.assert_close(springs.stiffening(*ends, only)[0], slope(only))
+    after = part.after(z, previous)
+    ends = [springs.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
+    bend, force = after - 2 * z + previous, springs.between(*ends, matrices.links)
+    lost = (z + bend / 4) @ matrices.stiffness + (z - previous + bend / 2) @ matrices.damping
+    torch.testing.assert_close(
+        bend @ matrices.inertia, force - lost, rtol=1e-3, atol=1e-3 * float(lost.detach().abs().max())
+    )
+
+
+@torch.no_grad()
+def test_the_stiffness_between_two_states_is_the_slope_of_the_damped_force() -> None:
+    model = neural_model()
+    springs, factor = model.template.body(0).springs, model.modal_scene(0).factor
+    draw = partial(torch.randn, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    z, other = 0.02 * draw(2, 1, 9)
+    first, second = springs.stretched(z), springs.stretched(other)
+    for damping in (0.0, 0.2):
+        tension = (first.stretch + second.stretch) / 2 + damping * (second.stretch - first.stretch)
+        only = (tension[0] > 0).double() * factor
+
+        def force(q, damping=damping, only=only):
+            return springs.between(first, springs.stretched(q[None]), only, damping)[0]
+
+        slope = torch.func.jacrev(force)(other[0])
+        torch.testing.assert_close(springs.stiffening(first, second, only, damping)[0], -2 * slope)
+
+
+@torch.no_grad()
+def test_damping_of_springs_takes_the_energy_that_is_lost_and_none_from_a_rotation() -> None:
+    part = neural_model(template=partial(MaterialTemplate, modes=9, links=Links(damping=0.1))).modal_scene(0)
+    part.damping = torch.zeros_like(part.damping)
+    before, now = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    energies, taken = [], []
+    for _ in range(40):
+        energies.append(part.energy(now, before))
+        after = part.after(now, before)
+        taken.append(part.dissipated(after, now, before))
+        before, now = now, after
+    energy, lost = torch.cat(energies), torch.cat(taken)
+    torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-3, atol=1e-4 * float(energy[0]))
+    assert float(energy[-1]) < 0.9 * float(energy[0]) and bool((lost > 0).all())
+    springs, turn = part.springs, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    turned = (turn - torch.eye(3)).flatten().expand(1, int(springs.ends.max()) + 1, 9)
+    ends = springs.stretched(0 * now), springs.stretched(0 * now, springs.strained(turned))
+    assert float(springs.dissipated(*ends, part.factor, 0.1)) < 1e-12
+
+
+@torch.no_grad()
+def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia(monkeypatch) -> None:
+    """A swing that turns springs by a tenth in a frame, the stiffest of them at 28 radians per frame."""
+    part = neural_model(template=partial(MaterialTemplate, modes=24, spacing=0.2, links=8)).modal_scene(0)
+    springs, times = part.springs, 10.0
+    along = (springs.offset[..., None] * springs.modes.unflatten(0, (-1, 3))).sum(1) / springs.length[:, None]
+    part.stiffness = part.stiffness + along.mT @ (((times - 1) * part.factor * springs.stiffness)[:, None] * along)
+    part.factor, part.damping = times * part.factor, torch.zeros_like(part.damping)
+    squares, modes = torch.linalg.eigh(part.stiffness)
+    assert float(squares[-1]) > 700
+    slowest = modes[:, 0]
+    slowest = slowest / (part.motions.unflatten(0, (-1, 12))[:, :3] @ slowest).norm(dim=-1).max()
+
+    def swing() -> torch.Tensor:
+        found = [0.7 * 0.3 * slowest[None], 0.3 * slowest[None]]
+        for _ in range(20):
+            found.append(part.after(found[-1], found[-2]))
+        return torch.stack(found)
+
+    made = swing()
+    monkeypatch.setattr(template, "CORRECTIONS", 30)
+    monkeypatch.setattr(template, "ASSEMBLED", 30)
+    exact = swing()
+    assert float((made - exact).norm() / exact.norm()) < 0.05
+    energies = [[float(part.energy(z[i + 1], z[i])) for i in range(len(z) - 1)] for z in (made, exact)]
+    assert max(energies[0]) < 1.01 * energies[0][0] and energies[1][-1] == pytest.approx(energies[1][0], rel=1e-9)
+
+
+@torch.no_grad()
+def test_forces_move_fast_modes_as_far_as_they_should() -> None:
+    """A force of one frame swings every linear mode by v sin(w t) / w; a steady one ends where K z = M a."""
+    model = neural_model(lever=0.0, output_scale=0.0)
+    batch, scene = model.batch((0,)), model.scenes[0]
+    prepared = model.prepare(batch)
+    part = prepared.template.parts[0][0]
+    part.factor, part.damping = torch.zeros_like(part.factor), torch.zeros_like(part.damping)
+    part.stiffness = 20 * part.stiffness
+    speed = 0.01 * torch.randn(9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    accelerations = (part.positions @ speed).view(-1, 3)[batch.finest[batch.simulated]] @ prepared.frames.axes[-1][0]
+    force = torch.zeros_like(scene.means)
+    force[scene.simulated] = prepared.mass[:, None] * accelerations / batch.dt**2
+
+    def rollout(frames: int, pushed: int) -> torch.Tensor:
+        state, found = SimState(scene.means, scene.means), []
+        for frame in range(frames):
+            made = model.step(batch, state, force if frame < pushed else None, prepared)
+            state = SimState(made.positions, state.positions)
+            change = (prepared.finest(state.positions) - prepared.levels[-1].rest)[None]
+            found.append(part.coordinates(change, change)[0][0])
+        return torch.stack(found)
+
+    lower = torch.linalg.cholesky(part.inertia)
+    inverse = torch.linalg.inv(lower)
+    squares, modes = torch.linalg.eigh(inverse @ part.stiffness @ inverse.mT)
+    assert float(squares[-1]) > 100
+    swings, velocities = (z @ lower @ modes for z in (rollout(20, 1), speed))
+    turns = 2 * torch.atan(squares.sqrt() / 2) * torch.arange(1, 21)[:, None]
+    torch.testing.assert_close(swings, velocities / squares.sqrt() * torch.sin(turns), atol=1e-5, rtol=1e-3)
+    part.damping = 0.2 * (part.inertia + part.stiffness / 4)
+    still = torch.linalg.solve(part.stiffness, part.inertia @ speed)
+    torch.testing.assert_close(rollout(150, 150)[-1], still, atol=1e-6, rtol=1e-3)
+
+
+def test_springs_start_from_the_lengths_of_a_strained_reference() -> None:
+    """With D the displacement gradient of the reference at the units, a spring is d_0 + D d_0 + Psi z."""
+    model = neural_model()
+    springs, count = model.template.body(0).springs, model.hierarchies[0].levels[1].count
+    draw = partial(torch.randn, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    slope, z, factor = 0.1 * draw(1, count, 9), (0.05 * draw(9)).requires_grad_(), 1 + 0.1 * draw(springs.ends.shape[1])
+    mean = slope[0, springs.ends].mean(0).view(-1, 3, 3)
+
+    def energy(z):
+        changes = (mean @ springs.offset[..., None])[..., 0] + (springs.modes @ z).view(-1, 3)
+        length = springs.offset.norm(dim=-1)
+        along = (springs.offset / length[:, None] * changes).sum(-1)
+        both = ((springs.offset + changes).norm(dim=-1) - length).square(), along.square()
+        return torch.stack([0.5 * (factor * springs.stiffness * x).sum() for x in both])
+
+    whole, linear = (torch.autograd.grad(energy(z)[i], z)[0] for i in range(2))
+    torch.testing.assert_close(
+        pull_of(springs, z.detach()[None], factor, slope)[0], linear - whole, atol=1e-7, rtol=1e-5
+    )
+    nothing = torch.zeros_like(z)
+    (pulled,) = torch.autograd.grad(energy(nothing.requires_grad_())[1], nothing)
+    torch.testing.assert_close(springs.pull(slope, factor)[0], -pulled, atol=1e-7, rtol=1e-5)
+    turn = quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    turned = (turn - torch.eye(3)).flatten().expand(1, count, 9)
+    still = nothing.detach()[None]
+    both = pull_of(springs, still, factor, turned) + springs.pull(turned, factor)
+    assert float(both.norm()) < 1e-5 * float(springs.pull(turned, factor).norm())  # a rotation strains nothing
+    stretched = 0.1 * torch.eye(3, dtype=torch.float64).flatten().expand(1, count, 9)
+    stiffer = springs.stiffening(*[springs.stretched(still, springs.strained(stretched))] * 2, factor)[0]
+    assert torch.linalg.eigvalsh(stiffer)[0] > 0  # what is taut resists more in every direction
+
+
+@torch.no_grad()
+def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it() -> None:
+    model = neural_model(lever=0.0, output_scale=0.0)
+    batch, scene = model.batch((0,)), model.scenes[0]
+    body = model.template.body(0)
+    start = model.smooth_motions(0).kernels @ torch.linspace(1, 0.2, 9, dtype=torch.float64)
+    for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
+        model.template.damping.fill_(damping / DAMPING_GAIN)
+        prepared = model.prepare(batch)
+        ((part, _, _),) = prepared.template.parts  # without links beyond the linear: only K is kept exactly
+        part.factor = torch.zeros_like(part.factor)
+        state = SimState(scene.means, scene.means - start)
+        first = float(model.energy(batch, state, prepared))
+        for _ in range(60):
+            step = model.step(batch, state, prepared=prepared)
+            state = SimState(step.positions, state.positions)
+        assert low <= float(model.energy(batch, state, prepared)) / first <= high
+    assert body.scale > 0
