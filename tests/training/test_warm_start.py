@@ -34,7 +34,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_checkpoint(
     toy: Path, tmp_path: Path, choice: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    common = [f"data.root={toy}", *choice, *QUICK, "+callbacks.warm_start.updates=60"]
+    common = [f"data.root={toy}", *choice, *QUICK, "callbacks.warm_start.updates=60"]
     assert train.main([*common, "trainer.max_epochs=2", f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
     printed = capsys.readouterr().out
     assert "warm start: 2 sequences tracked" in printed
@@ -100,5 +100,7 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
 
 
 def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="warm_start: expected updates and later >= 0"):
+    with pytest.raises(ConfigError, match="warm_start: expected updates, decay and later >= 0"):
         WarmStart(updates=-1)
+    with pytest.raises(ConfigError, match="decay=-0.1"):
+        WarmStart(decay=-0.1)

@@ -9,6 +9,7 @@ starts from there, with the network.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, cast
 
@@ -31,6 +32,8 @@ from gausim.training.supervision.images import Sources
 from gausim.training.supervision.motion_tracks import TrackSupervision
 from gausim.training.supervision.points import PointSupervision
 
+# Predicted frames of the rollouts that the number of updates is meant for.
+USUAL = 15
 # Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
 Tracked = list[tuple[SequenceSample, Tensor]]
 
@@ -50,29 +53,37 @@ class WarmStart(Callback):
         scene_lr: float = 0.1,
         template_lr: float = 1e-2,
         initial_lr: float = 2e-3,
+        decay: float = 0.0,
         later: float = 0.2,
         epochs: int = 30,
     ) -> None:
         """Stores the settings.
 
         Args:
-            updates: updates of the fit; 0 leaves out the warm start.
+            updates: updates of the fit; 0 leaves out the warm start. Longer rollouts than of 15 frames get fewer, for
+                the same cost.
             sequences: most sequences of an object in one update.
             scene_lr: learning rate of densities and attributes in the fit.
             template_lr: that of the template.
             initial_lr: that of the initial states.
+            decay: weight decay of the attributes in the fit; without it, long fits follow the errors of the tracks.
             later: factor on these three rates in the training that follows, which starts near the solution.
             epochs: most epochs of that training; its rates fall from the first on.
         """
-        if updates < 0 or min(sequences, epochs) < 1 or later < 0:
+        if updates < 0 or min(sequences, epochs) < 1 or min(decay, later) < 0:
             raise ConfigError(
-                "callbacks.warm_start: expected updates and later >= 0, sequences and epochs >= 1, got "
-                f"updates={updates}, later={later}, sequences={sequences}, epochs={epochs}."
+                "callbacks.warm_start: expected updates, decay and later >= 0, sequences and epochs >= 1, got "
+                f"updates={updates}, decay={decay}, later={later}, sequences={sequences}, epochs={epochs}."
             )
         self._updates, self._sequences, self._later, self._epochs = updates, sequences, later, epochs
         self._warm = False
         self._settings = OptimizerSettings(
-            scene_lr=scene_lr, template_lr=template_lr, initial_lr=initial_lr, clip_per_group=True
+            optimizer=torch.optim.AdamW,
+            scene_lr=scene_lr,
+            template_lr=template_lr,
+            initial_lr=initial_lr,
+            clip_per_group=True,
+            decay={"scene": decay},
         )
 
     def plan(self, trainer: Trainer, module: GausSimModule, data: ReadyDataModule) -> None:
@@ -124,9 +135,10 @@ class WarmStart(Callback):
             states.set_motion(number, moved[1])
             found.setdefault(sample.scene_id, []).append((sample, moved))
         motions = [(i, _Known(module, states, i, tracked, self._sequences)) for i, tracked in found.items()]
+        updates = math.ceil(self._updates * min(1.0, USUAL / last))
         with torch.enable_grad():
-            losses = modal_fit.fit(model, motions, self._settings, groups, longest=last, updates=self._updates)
-            for loss in with_bar(losses, "Fitting the material", total=self._updates, quiet=quiet):
+            losses = modal_fit.fit(model, motions, self._settings, groups, longest=last, updates=updates)
+            for loss in with_bar(losses, "Fitting the material", total=updates, quiet=quiet):
                 final = loss
         sequences = f"{count} sequence{'s' if count != 1 else ''}"
         print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
