@@ -213,7 +213,8 @@ def solid_body(
         modes: number of modes; at most three per free unit are returned.
         spacing: spacing of the grid [scene units].
     """
-    grid, centres, weights, whole, _ = _assembled(kernels, held, spacing)
+    body = _assembled(kernels, held, spacing)
+    grid, whole = body.grid, body.stiffness
     used = whole.diagonal() > 0
     nodes, values, _ = grid.splines(rest[~pinned])
     carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
@@ -222,24 +223,35 @@ def solid_body(
     eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes, rigid)
     full = np.zeros((3 * grid.size, vectors.shape[1]))
     full[used] = vectors
-    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), centres, weights)
+    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), body.centres, body.weights)
 
 
-def _assembled(
-    kernels: np.ndarray, held: np.ndarray, spacing: float
-) -> tuple[Grid, np.ndarray, np.ndarray, sp.csr_matrix, sp.csr_matrix]:
-    """Grid, centres and weights of the cells, stiffness with the springs of pins, and those springs' force per motion.
+@dataclass(frozen=True, eq=False)
+class _Assembled:
+    """Equations of a body that springs hold at its pinned kernels and in the cells nearest to them."""
 
-    Rows and columns of unused nodes are zero. The last matrix maps displacements (K, 3) of the pinned kernels,
-    flattened component by component, to forces on the nodes.
-    """
+    grid: Grid
+    centres: np.ndarray  # of the integration cells (Q, 3) [scene units]
+    weights: np.ndarray  # their volumes (Q,), see :class:`SolidBody`
+    stiffness: sp.csr_matrix  # of cells and springs; rows and columns of unused nodes are zero
+    places: np.ndarray  # where springs hold the body (P, 3) [scene units]
+    holders: np.ndarray  # the pinned kernel that moves with each (P,)
+    force: sp.csr_matrix  # of the springs on the nodes per motion (P, 3) of the places, component by component
+
+
+def _assembled(kernels: np.ndarray, held: np.ndarray, spacing: float) -> _Assembled:
     grid, centres, weights = cells(kernels, spacing)
     blocks = stiffness(grid, centres, weights)
     force = sp.csr_matrix((3 * grid.size, 0))
+    # What is held is not a shell either: kernels only show the surface of it.
+    solid = centres[weights == weights.max()]
+    nearest = cKDTree(kernels).query(solid)[1]
+    places = np.concatenate((kernels[held], solid[held[nearest]]))
+    holders = np.concatenate((np.flatnonzero(held), nearest[held[nearest]]))
     if held.any():
-        nodes, values, _ = grid.splines(kernels[held])
+        nodes, values, _ = grid.splines(places)
         hold = matrix(nodes, values, grid.size)
-        strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
+        strength = PIN_STIFFNESS * weights.sum() / (len(places) * spacing**2)
         for a in range(3):
             blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
         force = strength * sp.block_diag([hold.T] * 3).tocsr()
@@ -247,7 +259,7 @@ def _assembled(
     used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
     whole = whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])
     keep = sp.diags(used.astype(np.float64))
-    return grid, centres, weights, (keep @ whole @ keep).tocsr(), (keep @ force).tocsr()
+    return _Assembled(grid, centres, weights, (keep @ whole @ keep).tocsr(), places, holders, (keep @ force).tocsr())
 
 
 def static_responses(
@@ -268,16 +280,15 @@ def static_responses(
         Centre of every hand's kernels (G, 3), displacements (P, 3, G, 6) of the points and their gradients
         (P, 3, 3, G, 6) [1 / scene units] per unit translation along and rotation about each axis through that centre.
     """
-    held = hand >= 0
-    grid, _, _, whole, force = _assembled(kernels, held, spacing)
+    body = _assembled(kernels, hand >= 0, spacing)
+    grid, whole, of = body.grid, body.stiffness, hand[body.holders]
     used = whole.diagonal() > 0
     solve = factorized(whole[used][:, used].tocsc())
-    own, of = kernels[held], hand[held]
     count = int(hand.max()) + 1
-    centres = np.stack([own[of == g].mean(0) for g in range(count)])
+    centres = np.stack([kernels[hand == g].mean(0) for g in range(count)])
     field = np.zeros((3 * grid.size, count, 6))
     for g in range(count):
-        loads = force @ _flat(rigid_motions(own - centres[g]) * (of == g)[:, None, None])
+        loads = body.force @ _flat(rigid_motions(body.places - centres[g]) * (of == g)[:, None, None])
         field[used, g] = np.stack([solve(load) for load in loads[used].T], -1)
     nodes, values, gradients = grid.splines(points)
     at = field.reshape(3, grid.size, count, 6)[:, nodes]
