@@ -89,6 +89,16 @@ def test_a_held_bar_vibrates_as_theory_says() -> None:
     assert abs(cosine) > 0.99
 
 
+def test_a_body_is_held_inside_of_its_pinned_surface() -> None:
+    kernels = _shell((2.0, 2.0, 1.0), 0.125)
+    rest = np.stack(np.meshgrid(*[np.linspace(0.1, s - 0.1, 8) for s in (2.0, 2.0, 1.0)], indexing="ij"), -1)
+    rest = rest.reshape(-1, 3)
+    free = np.zeros(len(rest), dtype=bool)
+    body = solid.solid_body(kernels, kernels[:, 2] <= 0.5, rest, np.ones(len(rest)), free, modes=4, spacing=0.25)
+    core = np.array([[1.0, 1.0, 0.125], [1.0, 1.0, 0.25]])  # no kernel within .5, pinned ones are the nearest
+    assert np.abs(body.at(core)[0]).max() < 0.02 * np.abs(body.at(rest)[0]).max()
+
+
 def test_modes_are_orthonormal_under_the_units_mass_and_zero_where_pinned() -> None:
     values, phi, slopes, _, mass, pinned = _bar()
     lowest = phi[..., :24]
