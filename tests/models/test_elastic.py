@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import math
 from functools import partial
 
@@ -190,9 +191,24 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
     assert float(work) == pytest.approx(float(lost), rel=1e-4)
 
 
-@pytest.mark.parametrize("size", [0.1, 3.0, 100.0])
+def test_springs_follow_the_modes_of_a_checkpoint(elastic: ElasticScene) -> None:
+    """Modes of earlier versions may be others: here the last two change places."""
+    order = [0, 1, 2, 3, 4, 5, 6, 8, 7]
+    saved = elastic.state_dict()
+    saved = saved | {name: saved[name][..., order] for name in ("values", "modes", "projection", "gradients")}
+    other = copy.deepcopy(elastic)
+    other.load_state_dict(saved)
+    torch.testing.assert_close(other.springs.modes, elastic.springs.modes[:, order], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(other.springs.stiffness, elastic.springs.stiffness)
+    same = copy.deepcopy(elastic)
+    same.load_state_dict(elastic.state_dict())
+    assert torch.equal(same.springs.modes, elastic.springs.modes)
+
+
+# What the usual corrections leave unsolved is the largest in between.
+@pytest.mark.parametrize(("size", "limit"), [(0.1, 1.003), (3.0, 1.007), (100.0, 1.003)])
 def test_a_step_with_springs_adds_no_energy_however_large_the_swing(
-    size: float, monkeypatch: pytest.MonkeyPatch
+    size: float, limit: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     scene = _scene(hierarchy, period=6.0, geometric=1.0)
@@ -207,7 +223,7 @@ def test_a_step_with_springs_adds_no_energy_however_large_the_swing(
         return found
 
     energies = swing()
-    assert max(energies) < 1.01 * energies[0]  # by what the usual corrections leave unsolved
+    assert max(energies) < limit * energies[0]
     if size < 10:
         monkeypatch.setattr(template, "CORRECTIONS", 30)
         monkeypatch.setattr(template, "ASSEMBLED", 30)

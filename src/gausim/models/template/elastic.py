@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -74,13 +75,17 @@ class ElasticScene(nn.Module):
         self.inertia_mixing = nn.Parameter(torch.zeros(count, count))
         # Of every unit: density, stiffness of shear and of volume [k], beyond those of a homogeneous body under a load.
         self.beyond = nn.Parameter(torch.zeros(len(rest), 3))
-        self.springs = unit_springs(rest, phi, neighbours)
+        self._springs_of = partial(unit_springs, rest, neighbours=neighbours)
+        self.springs = self._springs_of(phi=phi)
         self.gain = nn.Parameter(torch.tensor(float(geometric)))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also of checkpoints that know no load."""
+        """Also of checkpoints that know no load, or other modes than are computed now: springs follow the modes."""
         state_dict.setdefault(f"{prefix}beyond", torch.zeros_like(self.beyond))
+        computed = self.modes.clone()
         super()._load_from_state_dict(state_dict, prefix, *args)
+        if not torch.equal(self.modes, computed):
+            self.springs = self._springs_of(phi=self.modes.double().cpu().numpy()).to(self.modes)
 
     def roots(self) -> tuple[Tensor, Tensor]:
         """S (M,) and L (M, M) of K = S L L^T S."""

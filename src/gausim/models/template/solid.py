@@ -246,8 +246,9 @@ def _assembled(kernels: np.ndarray, held: np.ndarray, spacing: float) -> _Assemb
     # What is held is not a shell either: kernels only show the surface of it.
     solid = centres[weights == weights.max()]
     nearest = cKDTree(kernels).query(solid)[1]
-    places = np.concatenate((kernels[held], solid[held[nearest]]))
-    holders = np.concatenate((np.flatnonzero(held), nearest[held[nearest]]))
+    inner = held[nearest]
+    places = np.concatenate((kernels[held], solid[inner]))
+    holders = np.concatenate((np.flatnonzero(held), nearest[inner]))
     if held.any():
         nodes, values, _ = grid.splines(places)
         hold = matrix(nodes, values, grid.size)
