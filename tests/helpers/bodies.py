@@ -11,13 +11,17 @@ from torch import Tensor
 
 from gausim.core import GaussianScene, SimState
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.solid import SolidSettings
 from gausim.models.template.springs import Springs
 from helpers.simulators import gausim
 
 # The settings of `model=gausim`, small.
 NEURAL = {
-    "template": partial(MaterialTemplate, modes=9, spacing=0.2, links=4, hidden=8),
+    "template": partial(
+        MaterialTemplate, modes=9, solid=SolidSettings(0.2, held_inside=True, finite_strain=True), links=4, hidden=8
+    ),
     "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
     "body_frame": True, "edges": "rest", "attributes": 3,
 }  # fmt: skip
@@ -79,7 +83,9 @@ def permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
     return replace(scene, **{n: getattr(scene, n)[order] for n in names})
 
 
-def pull_of(springs: Springs, z: Tensor, factor: Tensor | float = 1.0, strain: Tensor | None = None) -> Tensor:
+def pull_of(
+    springs: Springs | FiniteStrain, z: Tensor, factor: Tensor | float = 1.0, strain: Tensor | None = None
+) -> Tensor:
     """Nonlinear force (S, M) of springs that stay in the state z (S, M)."""
     taut = None if strain is None else springs.strained(strain)
     return springs.between(*[springs.stretched(z, taut)] * 2, factor)

@@ -103,6 +103,9 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         ),
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
+    "gausim.models.template.material.MaterialTemplate": {
+        "solid": ("gausim.models.template.solid.SolidSettings", ("spacing",)),
+    },
     "gausim.losses.objective.Objective": {
         "energy": (
             "gausim.losses.objective.EnergyLoss",

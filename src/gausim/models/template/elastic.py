@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,6 +46,7 @@ class ElasticScene(nn.Module):
         self,
         hierarchy: Hierarchy, finest: int, *,
         modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: float,
+        held_inside: bool = False,
     ) -> None:  # fmt: skip
         """Initialises from ``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric``."""
         super().__init__()
@@ -57,7 +57,8 @@ class ElasticScene(nn.Module):
         pinned = level.pinned.numpy()
         finer = hierarchy.levels[0]
         kernels, spacing = finer.rest.double().numpy(), solid * hierarchy.diagonal
-        body = solid_body(kernels, finer.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=spacing)
+        held = finer.pinned.numpy()
+        body = solid_body(kernels, held, rest, mass, pinned, modes=modes, spacing=spacing, inside=held_inside)
         values, phi, slopes, strains = body.of_units(rest, pinned)
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
@@ -75,17 +76,13 @@ class ElasticScene(nn.Module):
         self.inertia_mixing = nn.Parameter(torch.zeros(count, count))
         # Of every unit: density, stiffness of shear and of volume [k], beyond those of a homogeneous body under a load.
         self.beyond = nn.Parameter(torch.zeros(len(rest), 3))
-        self._springs_of = partial(unit_springs, rest, neighbours=neighbours)
-        self.springs = self._springs_of(phi=phi)
+        self.springs = unit_springs(rest, phi, neighbours)
         self.gain = nn.Parameter(torch.tensor(float(geometric)))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also of checkpoints that know no load, or other modes than are computed now: springs follow the modes."""
+        """Also of checkpoints that know no load."""
         state_dict.setdefault(f"{prefix}beyond", torch.zeros_like(self.beyond))
-        computed = self.modes.clone()
         super()._load_from_state_dict(state_dict, prefix, *args)
-        if not torch.equal(self.modes, computed):
-            self.springs = self._springs_of(phi=self.modes.double().cpu().numpy()).to(self.modes)
 
     def roots(self) -> tuple[Tensor, Tensor]:
         """S (M,) and L (M, M) of K = S L L^T S."""
@@ -171,6 +168,7 @@ class ElasticTemplate(Template):
         amplitude: float = 0.02,
         geometric: float = 1.0,
         solid: float = 0.12,
+        held_inside: bool = False,
         attributes: int = 0,
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
@@ -186,6 +184,7 @@ class ElasticTemplate(Template):
             amplitude: typical displacement [diagonals], the size of initial velocities.
             geometric: initial factor on the springs' nonlinear force, trained.
             solid: spacing of the grid on which the modes of the body around the kernels are computed [diagonals].
+            held_inside: hold what is nearest to pinned kernels within the body, too (runs of before do not).
             attributes: number of attributes per unit, unused: the material of a scene is in its matrices.
             frames: axes of the scenes, unused.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
@@ -195,7 +194,7 @@ class ElasticTemplate(Template):
         self.scenes = nn.ModuleList(
             ElasticScene(
                 h, finest, modes=modes, neighbours=neighbours, period=period, amplitude=amplitude,
-                geometric=geometric, solid=solid,
+                geometric=geometric, solid=solid, held_inside=held_inside,
             )
             for h in hierarchies
         )  # fmt: skip

@@ -19,10 +19,11 @@ damping. These factors give, in modal coordinates z,
 k, c_0 and c_1 are trained numbers common to all scenes. In a step of the trapezoidal rule an even drag c_0 reduces the
 amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the first part of the factor
 of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and strong drag would turn the
-velocity round instead of stopping it. The links of stiffness e^{g_ij} are springs with geometric
-nonlinearity, and with damping of their lengths, which no rotation of the body meets: without it, vibrations near the
-frame rate ring on. A frame is the step that all modal templates have in common
-(:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
+velocity round instead of stopping it. What is nonlinear are either the cells of the units, with e^{s_i} and e^{b_i}
+(finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
+:mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
+the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
+common (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
 that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for
 the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
 orientations.
@@ -43,13 +44,16 @@ from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.solid import FIRST, SECOND, SolidBody, solid_body
+from gausim.models.template.finite_strain import FiniteStrain
+from gausim.models.template.solid import FIRST, SECOND, SolidBody, SolidSettings, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
 from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template, force_of_strain
 from gausim.nn.mlp import mlp
 
 # Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
+# Lowest modes of which derivatives are among the modes of a body with finite strain: 21 of 48.
+CURVED = 6
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
@@ -64,13 +68,17 @@ class Links:
     """Links between neighbouring units."""
 
     neighbours: int = 12  # of a unit
-    linear: float = 0.3  # initial stiffness and inertia of all linear links, as fractions (of the trace) of the body's
-    springs: float = 0.15  # the same for the stiffness of nonlinear links; its linear part is in K, the rest in f and J
-    damping: float = 0.0  # of the nonlinear links' lengths, over their stiffness [frames at 24 per second]
+    linear: float = 0.3  # initial stiffness and inertia of all links over the body's (see :class:`BodyModes`)
+    springs: float = 0.15  # the same for the stiffness of links e^{g_ij}; its linear part is in K
+    damping: float = 0.0  # resistance to the growth of length or strain over that to it [frames at 24 per second]
 
 
 class BodyModes(nn.Module):
-    """Constants of one scene's geometry in modal coordinates; without trained parameters."""
+    """Constants of one scene's geometry in modal coordinates; without trained parameters.
+
+    All links together are as stiff as the body: in the sum over the modes, or, with finite strain, in their mean. The
+    derivatives among the modes are so stiff that nothing else would count in a sum.
+    """
 
     modes: Tensor  # Phi (N, 3, M), orthonormal under the units' volumes
     gradients: Tensor  # displacement gradients of the modes (N, 3, 3, M) [1 / scene units]
@@ -83,8 +91,11 @@ class BodyModes(nn.Module):
     between: Tensor  # root of T_ij, (E, 3, M)
     distance: Tensor  # logarithm of the links' lengths over their mean (E,)
     springs: Springs  # the links as springs, with stiffness per unit of S_ij
+    cells: FiniteStrain | None  # of the homogeneous body, if its strain is finite
 
-    def __init__(self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, spacing: float, links: int):
+    def __init__(
+        self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, solid: SolidSettings, links: int
+    ) -> None:
         """Computes the constants in the axes ``frame`` (3, 3) of the body; see :class:`MaterialTemplate`."""
         super().__init__()
         level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
@@ -92,8 +103,11 @@ class BodyModes(nn.Module):
         mass = level.volume.double().numpy()
         mass = mass / mass[~pinned].mean()
         own = kernels.rest.double().numpy() @ frame.T
-        size = spacing * hierarchy.diagonal
-        body = solid_body(own, kernels.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=size)
+        size, finite = solid.spacing * hierarchy.diagonal, solid.finite_strain
+        body = solid_body(
+            own, kernels.pinned.numpy(), rest, mass, pinned,
+            modes=modes, spacing=size, inside=solid.held_inside, curved=CURVED if finite else 0,
+        )  # fmt: skip
         phi, slope = body.at(rest)
         phi[pinned], slope[pinned] = 0, 0
         lowest = body.values[0]
@@ -102,14 +116,16 @@ class BodyModes(nn.Module):
         offset = rest[pairs[1]] - rest[pairs[0]]
         length = np.linalg.norm(offset, axis=1)
         stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
-        even = math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
+        values = np.maximum(body.values, 1e-6 * body.values[-1]) / lowest
+        weight = 1 / values if finite else np.ones_like(values)
+        even = math.sqrt((weight * body.values).sum() / lowest / max(float((weight * stretch**2).sum()), 1e-30))
         # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
         self.tie = math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
         arrays = {
             "modes": phi,
             "gradients": slope,
             "projection": phi * mass[:, None, None],
-            "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
+            "values": values,
             "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
             "strain": body.strains(rest),
             "inertia": phi * np.sqrt(mass)[:, None, None],
@@ -120,6 +136,7 @@ class BodyModes(nn.Module):
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
         self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
+        self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
         self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
 
 
@@ -155,12 +172,13 @@ class Matrices:
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     inertia: Float[Tensor, "M M"]  # M (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
-    links: Float[Tensor, " E"]  # factor on every link's nonlinear spring stiffness (E,)
+    units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
+    springs: Float[Tensor, " E"]  # k e^{g_ij} of every link, in units of S_ij (E,)
     density: Float[Tensor, " N"]  # of every unit over that at the beginning
     between: Float[Tensor, " E"]  # mass of every link in units of T_ij
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
     tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
-    link_damping: Tensor | float  # of the nonlinear links' lengths, over their stiffness
+    growth: Tensor | float  # resistance to the growth of length or strain over that to it [frames]
 
 
 class MaterialTemplate(Template):
@@ -178,7 +196,7 @@ class MaterialTemplate(Template):
         attributes: int,
         frames: Sequence[np.ndarray],
         modes: int = 48,
-        spacing: float = 0.12,
+        solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
         hidden: int = 48,
         period: float = 8.0,
@@ -193,7 +211,7 @@ class MaterialTemplate(Template):
             attributes: number of attributes per unit.
             frames: axes (3, 3) of each scene in which the template works.
             modes: number of modes.
-            spacing: spacing of the solid body's grid [diagonals].
+            solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
@@ -210,8 +228,9 @@ class MaterialTemplate(Template):
             )
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
+        solid = solid if isinstance(solid, SolidSettings) else SolidSettings(solid)
         self.bodies = nn.ModuleList(
-            BodyModes(h, finest, f, modes=modes, spacing=spacing, links=self.links.neighbours)
+            BodyModes(h, finest, f, modes=modes, solid=solid, links=self.links.neighbours)
             for h, f in zip(hierarchies, frames, strict=True)
         )
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
@@ -252,7 +271,8 @@ class MaterialTemplate(Template):
         drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
         springs = self.links.springs * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
-        stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
+        cells = units[:, :2].exp()
+        stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness) + body.stretch.mT @ stretch
         density, between = _saturated(log_density).exp(), self.links.linear * links[:, 1].exp()
         heavy = density[:, None, None] * body.inertia
         root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
@@ -262,11 +282,11 @@ class MaterialTemplate(Template):
         dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
         dragged = dragged + body.between.flatten(0, 1).mT @ (slowed * tied).flatten(0, 1)
         damping = dragged + (dragged.trace() / inertia.trace() / 4 + viscosity / frame) * k * stiffness
-        uneven = k * (units[:, :2].exp() - 1)
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
         return Matrices(
-            k * stiffness, inertia, damping, k * springs, density, between, uneven, tense, self.links.damping / frame
-        )
+            k * stiffness, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1), tense,
+            self.links.damping / frame,
+        )  # fmt: skip
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, damping and density of the units as they enter K, D and M.
@@ -330,10 +350,13 @@ class PreparedMaterial(ModalScene):
         ``reference`` is k at the start [1 / frame^2], to which corrections are relative.
         """
         super().__init__(body.projection, body.modes, body.gradients)
-        self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
+        self.matrices, self.positions = matrices, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
-        self.factor, self.spring_damping = matrices.links, matrices.link_damping
+        self.springs, self.factor = body.springs, matrices.springs
+        if body.cells is not None:
+            self.springs, self.factor, self.corrections = body.cells, matrices.units, 4
+        self.spring_damping = matrices.growth
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.
@@ -345,7 +368,7 @@ class PreparedMaterial(ModalScene):
         tied = self.body.tie * self.matrices.between[:, None] * (second - first)
         own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
         own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
-        own = own + self.springs.pull(strain, self.matrices.tense)
+        own = own + self.body.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
     def correction_unit(self) -> Float[Tensor, ""]:

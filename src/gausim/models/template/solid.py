@@ -8,6 +8,7 @@ mass is that of the units. The resulting modes are smooth across gaps between ke
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -139,6 +140,15 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
     ]
 
 
+@dataclass(frozen=True)
+class SolidSettings:
+    """How the body around the kernels is modelled; runs that name no more than ``spacing`` have these defaults."""
+
+    spacing: float = 0.12  # of the grid [diagonals]
+    held_inside: bool = False  # pinned kernels hold what is within the body beside them, too
+    finite_strain: bool = False  # of the body's cells; else the springs between units are what is nonlinear
+
+
 @dataclass(frozen=True, eq=False)
 class SolidBody:
     """The lowest modes of a body as a field on a grid."""
@@ -177,6 +187,13 @@ class SolidBody:
             len(rest), 9, -1
         ) / self.values[0]
 
+    def mean_gradients(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean displacement gradients of the modes in the cells near each unit (N, 9, M), and their volume (N,)."""
+        shares = self.shares(rest)
+        volume = np.asarray(shares.sum(1)).ravel()
+        slopes = self.at(self.centres)[1].reshape(len(self.centres), -1)
+        return (shares @ slopes / np.maximum(volume, 1e-30)[:, None]).reshape(len(rest), 9, -1), volume
+
     def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
 
@@ -201,6 +218,8 @@ def solid_body(
     *,
     modes: int,
     spacing: float,
+    inside: bool = True,
+    curved: int = 0,
 ) -> SolidBody:
     """Lowest modes of the body around the kernels; of a body that nothing holds, without its six rigid motions.
 
@@ -212,23 +231,84 @@ def solid_body(
         pinned: mask of the pinned units (N,).
         modes: number of modes; at most three per free unit are returned.
         spacing: spacing of the grid [scene units].
+        inside: also hold what is nearest to pinned kernels within the body.
+        curved: of so many of the lowest modes derivatives join the modes, up to half of them (:func:`derivatives`).
     """
-    body = _assembled(kernels, held, spacing)
+    body = _assembled(kernels, held, spacing, inside=inside)
     grid, whole = body.grid, body.stiffness
     used = whole.diagonal() > 0
     nodes, values, _ = grid.splines(rest[~pinned])
     carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
     root = np.tile(np.sqrt(mass[~pinned]), 3)
     rigid = None if held.any() else grid.rigid_coefficients()[used]
-    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes, rigid)
+    whole, carry = whole[used][:, used], sp.diags(root) @ carry
+    eigenvalues, vectors = lowest(whole, carry, modes, rigid)
+    if curved:
+        found = SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights)
+        bent = derivatives(found, curved, whole, used, carry, rigid)
+        eigenvalues, vectors = _joined(vectors, bent, whole, carry)
+    return SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights)
+
+
+def _full(vectors: np.ndarray, used: np.ndarray, grid: Grid) -> np.ndarray:
+    """Coefficients (3, nodes, M) of vectors on the used nodes."""
     full = np.zeros((3 * grid.size, vectors.shape[1]))
     full[used] = vectors
-    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), body.centres, body.weights)
+    return full.reshape(3, grid.size, -1)
+
+
+def derivatives(
+    body: SolidBody, count: int, whole: sp.spmatrix, used: np.ndarray, carry: sp.spmatrix, rigid: np.ndarray | None
+) -> np.ndarray:
+    """Modal derivatives (D, P): static answers to the second-order forces of pairs of the ``count`` lowest modes.
+
+    A body that bends far also shortens; linear modes cannot say so, and finite strain in them is far too stiff. What
+    is missing solves K x = -Q(H_i, H_j), Q the part of the forces of finite strain that is quadratic in the
+    displacement gradients H (Idelsohn and Cardona 1985; Barbic and James 2005, whose weights these have).
+    """
+    nodes, _, gradients = body.grid.splines(body.centres)
+    slopes = [matrix(nodes, gradients[..., a], body.grid.size) for a in range(3)]
+    h = np.moveaxis(body.at(body.centres)[1][..., :count], -1, 0)  # (count, Q, 3, 3)
+    stress = [_stress(x) for x in h]
+    solve, found = factorized(whole.tocsc()), []
+    for i, j in itertools.combinations_with_replacement(range(len(h)), 2):
+        force = _stress(h[i].transpose(0, 2, 1) @ h[j]) + h[i] @ stress[j] + h[j] @ stress[i]
+        force *= body.weights[:, None, None]
+        load = -np.concatenate([sum(slopes[b].T @ force[:, a, b] for b in range(3)) for a in range(3)])[used]
+        if rigid is not None:  # free of what would accelerate the whole body
+            moved = carry @ rigid
+            load -= carry.T @ (moved @ np.linalg.solve(moved.T @ moved, rigid.T @ load))
+        found.append(solve(load) / np.sqrt(body.values[i] * body.values[j]))
+    x = np.stack(found, 1)
+    if rigid is not None:
+        x -= rigid @ np.linalg.lstsq(carry @ rigid, carry @ x, rcond=None)[0]
+    return x
+
+
+def _stress(gradient: np.ndarray) -> np.ndarray:
+    """Hooke's stress (Q, 3, 3) of the symmetric part of displacement gradients, at Young's modulus 1."""
+    trace = np.trace(gradient, axis1=1, axis2=2)[:, None, None]
+    return FIRST * trace * np.eye(3) + SECOND * (gradient + gradient.transpose(0, 2, 1))
+
+
+def _joined(
+    vectors: np.ndarray, bent: np.ndarray, whole: sp.spmatrix, carry: sp.spmatrix
+) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors, as many as ``vectors``, of the lowest of them and the largest parts of ``bent``."""
+    more = min(bent.shape[1], vectors.shape[1] // 2)
+    kept = vectors[:, : vectors.shape[1] - more]
+    bent = bent - kept @ ((carry @ kept).T @ (carry @ bent))
+    _, sizes, parts = np.linalg.svd(carry @ bent, full_matrices=False)
+    more = min(more, int((sizes > 1e-6 * sizes[0]).sum()))
+    basis = np.concatenate((kept, bent @ parts[:more].T / sizes[:more]), 1)
+    moved = carry @ basis
+    values, turned = eigh(basis.T @ (whole @ basis), moved.T @ moved)
+    return values, basis @ turned
 
 
 @dataclass(frozen=True, eq=False)
 class _Assembled:
-    """Equations of a body that springs hold at its pinned kernels and in the cells nearest to them."""
+    """Equations of a body that springs hold at its pinned kernels and, inside, in the cells nearest to them."""
 
     grid: Grid
     centres: np.ndarray  # of the integration cells (Q, 3) [scene units]
@@ -239,16 +319,16 @@ class _Assembled:
     force: sp.csr_matrix  # of the springs on the nodes per motion (P, 3) of the places, component by component
 
 
-def _assembled(kernels: np.ndarray, held: np.ndarray, spacing: float) -> _Assembled:
+def _assembled(kernels: np.ndarray, held: np.ndarray, spacing: float, *, inside: bool = True) -> _Assembled:
     grid, centres, weights = cells(kernels, spacing)
     blocks = stiffness(grid, centres, weights)
     force = sp.csr_matrix((3 * grid.size, 0))
-    # What is held is not a shell either: kernels only show the surface of it.
-    solid = centres[weights == weights.max()]
-    nearest = cKDTree(kernels).query(solid)[1]
-    inner = held[nearest]
-    places = np.concatenate((kernels[held], solid[inner]))
-    holders = np.concatenate((np.flatnonzero(held), nearest[inner]))
+    places, holders = kernels[held], np.flatnonzero(held)
+    if inside and held.any():  # what is held is not a shell either: kernels only show the surface of it
+        solid = centres[weights == weights.max()]
+        nearest = cKDTree(kernels).query(solid)[1]
+        inner = held[nearest]
+        places, holders = np.concatenate((places, solid[inner])), np.concatenate((holders, nearest[inner]))
     if held.any():
         nodes, values, _ = grid.splines(places)
         hold = matrix(nodes, values, grid.size)

@@ -20,16 +20,13 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.solid import FIRST, SECOND
 from gausim.models.template.springs import Springs
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
-# Corrections of a step for the springs, and those of them for which their stiffness is computed. The first is that of
-# the state at the beginning. It misses how far springs turn within the frame: where they are far stiffer than inertia,
-# corrections with it alone do not converge. With the second, between the ends of the frame, they do.
-CORRECTIONS, ASSEMBLED = 3, 2
 # Least part of an impulse that damping leaves in its first frame.
 LEAST_LEFT = 0.1
 DENSITY = "density over that at the beginning of training"
@@ -162,9 +159,13 @@ class ModalScene:
     inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
     stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
     damping: Float[Tensor, "M M"]  # modal damping
-    springs: Springs  # nonlinear
-    factor: Tensor  # on the springs' stiffness, of all or of each (E,)
-    spring_damping: Tensor | float = 0.0  # of the springs' lengths, over their stiffness [frames]
+    springs: Springs | FiniteStrain  # nonlinear
+    factor: Tensor  # on the springs' stiffness, of all or of each (E,); of the solid's shear and volume (N, 2)
+    spring_damping: Tensor | float = 0.0  # of the springs' lengths or the solid's strains, over stiffness [frames]
+    # Corrections of a step; for all but the last stiffness is computed. The first is that of the state at the start. It
+    # misses how far the body turns within the frame: where it is far stiffer than inertia, corrections with it alone do
+    # not converge. With the others, between the ends of the frame, they do.
+    corrections = 3
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -220,9 +221,9 @@ class ModalScene:
             taut, force = springs.strained(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
         first, now = springs.stretched(z - speed / 2, taut), springs.stretched(z, taut)
-        for correction in range(CORRECTIONS):
+        for correction in range(self.corrections):
             second = springs.stretched(z + (speed + bend) / 2, taut)
-            if correction < ASSEMBLED:
+            if correction < self.corrections - 1:
                 with torch.no_grad():
                     ends = (first, second) if correction else (now, now)
                     operator = linear + springs.stiffening(*ends, factor, damping) / 4

@@ -1,0 +1,121 @@
+"""Forces of finite strain: what a solid body's stresses pull beyond those of small displacements."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.models.template.solid import FIRST, SECOND
+
+
+class Strained(NamedTuple):
+    """The body in a state."""
+
+    gradient: Float[Tensor, "S N 3 3"]  # of the displacement, H
+    strain: Float[Tensor, "S N 3 3"]  # Green's strain E = (H + H^T + H^T H) / 2
+
+
+class FiniteStrain(nn.Module):
+    """Nonlinear forces of a solid under large rotations and strains, in modal coordinates.
+
+    Of every unit the cells near it have the energy w sigma(E) : E / 2 with Green's strain E and Hooke's law
+    sigma(E) = 2 mu s E + lambda b tr(E) I (Saint Venant and Kirchhoff), linearised w sigma(eps) : eps / 2 with the
+    small strain eps = (H + H^T) / 2. The force is minus the derivative of their difference, so it has a potential and
+    is of second order in z; the linear part is in the matrices. Rotations, of which E knows nothing, cost no energy. s
+    and b are the unit's ``factor``. Where the reference of the modes is itself strained, by S, H = S + sum_m H_m z_m.
+    """
+
+    gradients: Tensor  # H_m, displacement gradients of the modes near the units, row by row (9 N, M) [1 / scene units]
+    volume: Tensor  # w of the cells near each unit (N,)
+
+    def __init__(self, gradients: np.ndarray, volume: np.ndarray, *, scale: float = 1.0) -> None:
+        """Takes displacement gradients (N, 9, M) of the modes and volumes (N,), in multiples of 1 / ``scale``."""
+        super().__init__()
+        for name, array in {"gradients": gradients.reshape(-1, gradients.shape[-1]), "volume": scale * volume}.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
+
+    def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
+        """S of every unit."""
+        return strain.unflatten(-1, (3, 3))
+
+    def stretched(self, z: Float[Tensor, "S M"], taut: Float[Tensor, "S N 3 3"] | None = None) -> Strained:
+        """The body in a state of the modes; ``taut`` is what the reference's strain changes (:meth:`strained`)."""
+        gradient = (z @ self.gradients.mT).unflatten(-1, (-1, 3, 3))
+        gradient = gradient if taut is None else gradient + taut
+        return Strained(gradient, (gradient + gradient.mT + gradient.mT @ gradient) / 2)
+
+    def between(
+        self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0
+    ) -> Float[Tensor, "S M"]:
+        """Mean nonlinear force from one state to another, whose work is the loss of :meth:`potential` and damping.
+
+        The mean of both stresses acts on the mean of both deformations (Simo and Tarnow 1992), and more by ``damping``
+        times the growth of strain (Armero and Romero 2001), which no rotation changes.
+        """
+        gradient, stress = self._means(first, second, factor, damping)
+        beyond = stress + gradient @ stress - self._stress((gradient + gradient.mT) / 2, factor)
+        return -(beyond.flatten(1) @ self.gradients)
+
+    def stiffening(
+        self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0
+    ) -> Float[Tensor, "S M M"]:
+        """Twice the negative derivative of :meth:`between` with respect to z of the second state.
+
+        With the mean F and S of both deformation gradients and stresses, F_2 of the second state and a motion H, that
+        is H S + (1 + 2 damping) F sigma(sym(F_2^T H)) - sigma(sym H). Compressed matter buckles; S is then made
+        positive semi-definite by an isotropic tension, so that with the linear stiffness this is, too.
+        """
+        one = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
+        gradient, stress = self._means(first, second, factor, damping)
+        own = stress.diagonal(dim1=-2, dim2=-1)
+        least = (own - (stress.abs().sum(-1) - own.abs())).amin(-1)  # Gershgorin's bound of the eigenvalues
+        stress = stress + (-least).clamp_min(0)[..., None, None] * one
+        shear, bulk = (x[:, None, None] for x in (self.volume[:, None] * factor).unbind(-1))
+        mean, last = gradient + one, second.gradient + one
+        grown, lame = (1 + 2 * damping) * SECOND * shear * mean, (1 + 2 * damping) * FIRST * bulk * mean
+        # Blocks (9, 9) of every unit, by rows and columns of what is pulled and of what moves.
+        blocks = torch.einsum("...ac,bd->...abcd", grown @ last.mT, one)
+        blocks = (
+            blocks
+            + torch.einsum("...ad,...cb->...abcd", grown, last)
+            + torch.einsum("...ab,...cd->...abcd", lame, last)
+        )
+        blocks = blocks + torch.einsum("ac,...bd->...abcd", one, stress)
+        even, swapped = (torch.einsum(f"ab,cd->{order}", one, one) for order in ("acbd", "acdb"))
+        linear = SECOND * shear[..., None, None] * (even + swapped)
+        linear = linear + FIRST * bulk[..., None, None] * torch.einsum("ab,cd->abcd", one, one)
+        blocks = (blocks - linear).flatten(-4, -3).flatten(-2)
+        turned = blocks @ self.gradients.unflatten(0, (-1, 9))
+        return self.gradients.mT @ turned.flatten(-3, -2)
+
+    def potential(self, state: Strained, factor: Float[Tensor, "N 2"]) -> Float[Tensor, " S"]:
+        """Potential energy of the nonlinear force."""
+        small = (state.gradient + state.gradient.mT) / 2
+        energies = (self._stress(e, factor) * e for e in (state.strain, small))
+        whole, linear = (0.5 * energy.flatten(1).sum(-1) for energy in energies)
+        return whole - linear
+
+    def dissipated(
+        self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float
+    ) -> Float[Tensor, " S"]:
+        """Energy that ``damping`` takes from one state to another."""
+        grown = second.strain - first.strain
+        return damping * (self._stress(grown, factor) * grown).flatten(1).sum(-1)
+
+    def _means(
+        self, first: Strained, second: Strained, factor: Tensor, damping: Tensor | float
+    ) -> tuple[Float[Tensor, "S N 3 3"], Float[Tensor, "S N 3 3"]]:
+        """Mean displacement gradient and mean stress times volume."""
+        strain = (first.strain + second.strain) / 2 + damping * (second.strain - first.strain)
+        return (first.gradient + second.gradient) / 2, self._stress(strain, factor)
+
+    def _stress(self, strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
+        """Hooke's stress of a strain, times volume."""
+        shear, bulk = (self.volume[:, None] * factor).unbind(-1)
+        pressure = FIRST * bulk * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
+        one = torch.eye(3, dtype=strain.dtype, device=strain.device)
+        return 2 * SECOND * shear[:, None, None] * strain + pressure[..., None, None] * one
