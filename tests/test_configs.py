@@ -43,7 +43,7 @@ SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 def compose_option(option: str) -> DictConfig:
     group, name = option_of(conf_dir() / f"{option}.yaml")
-    return compose("train", [f"{group}={name}"])
+    return compose("train", [f"{group}={name}", *(["model=gausim"] if group == "ablation" else [])])
 
 
 def targets(node: Any) -> Iterator[DictConfig]:

@@ -32,7 +32,7 @@ from gausim.cli.main import COMMANDS, main
         ("train model=gausim_", {"model=gausim_elastic", "model=gausim_paper"}),
         ("train mod", {"model=", "model."}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
-        ("train model=gausim model.simulator.template.spac", {"model.simulator.template.spacing="}),
+        ("train model=gausim model.simulator.template.perio", {"model.simulator.template.period="}),
         ("train loss.image.win", {"loss.image.window="}),  # which no configuration lists
         ("train model=spring_mass model.simulator.network.comp", set()),
         ("train model.simulator.template.spac", set()),  # the default model has none

@@ -102,13 +102,13 @@ def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsy
 
 
 def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
-    wrong = ["sed=1", "model.simulator.template.spaicng=1", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
+    wrong = ["sed=1", "model.simulator.template.peroid=1", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
     assert main(["config", "validate", *wrong, "model=gausim", "trainer.max_minutes=soon"]) == 1
     told = capsys.readouterr()
     for expected in (
         "sed: unknown key. Did you mean 'seed'?",
         # Which only this model has.
-        "model.simulator.template.spaicng: unknown key. Did you mean 'model.simulator.template.spacing'?",
+        "model.simulator.template.peroid: unknown key. Did you mean 'model.simulator.template.period'?",
         "trainer.max_epoch: unknown key. Did you mean 'trainer.max_epochs'?",
         "Available options in 'render': auto cpu gsplat reference",
         "seed=x: Value 'x' of type 'str' could not be converted to Integer",

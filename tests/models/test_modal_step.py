@@ -26,7 +26,7 @@ def _elastic(*, modes: int = 9, solid: float = 0.2) -> PreparedElastic:
 
 def _springs() -> tuple[Springs, torch.Tensor]:
     """Springs and a factor on each."""
-    springs = _elastic().springs
+    springs = _elastic().nonlinear
     draw = torch.rand(springs.ends.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     return springs, 1 + draw
 
@@ -61,8 +61,8 @@ def test_the_step_solves_its_equation(body: str) -> None:
     usual, part.corrections = part.after(z, previous), 30
     after = part.after(z, previous)
     assert float((usual - after).norm()) < 0.01 * float((after - 2 * z + previous).norm())
-    ends = [part.springs.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
-    bend, force = after - 2 * z + previous, part.springs.between(*ends, part.factor, part.spring_damping)
+    ends = [part.nonlinear.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
+    bend, force = after - 2 * z + previous, part.nonlinear.between(*ends, part.factor, part.growth)
     lost = (z + bend / 4) @ part.stiffness + (z - previous + bend / 2) @ part.damping
     assert float(force.norm()) > 1e-3 * float(lost.norm())
     torch.testing.assert_close(bend @ part.inertia, force - lost, rtol=1e-6, atol=1e-6 * float(lost.abs().max()))
@@ -105,7 +105,7 @@ def test_the_stiffness_between_two_states_is_the_slope_of_the_damped_force() -> 
 @torch.no_grad()
 def test_damping_of_strain_takes_the_energy_that_is_lost_and_none_from_a_rotation(body: str) -> None:
     part = _elastic() if body == "springs" else neural_model().modal_scene(0)
-    part.spring_damping, part.corrections = 0.1, 30
+    part.growth, part.corrections = 0.1, 30
     part.damping = torch.zeros_like(part.damping)
     before, now = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     energies, taken = [], []
@@ -117,7 +117,7 @@ def test_damping_of_strain_takes_the_energy_that_is_lost_and_none_from_a_rotatio
     energy, lost = torch.cat(energies), torch.cat(taken)
     torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-3, atol=1e-4 * float(energy[0]))
     assert float(energy[-1]) < 0.9 * float(energy[0]) and bool((lost > 0).all())
-    springs, turn = part.springs, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    springs, turn = part.nonlinear, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
     turned = (turn - torch.eye(3)).flatten().expand(1, len(part.motions) // 12, 9)
     ends = springs.stretched(0 * now), springs.stretched(0 * now, springs.strained(turned))
     assert float(springs.dissipated(*ends, part.factor, 0.1)) < 1e-12
@@ -127,7 +127,7 @@ def test_damping_of_strain_takes_the_energy_that_is_lost_and_none_from_a_rotatio
 def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia() -> None:
     """A swing that turns springs by a fifteenth in a frame, the stiffest of them at 27 radians per frame."""
     part = _elastic(modes=24)
-    springs, times = part.springs, 60.0
+    springs, times = part.nonlinear, 60.0
     along = (springs.offset[..., None] * springs.modes.unflatten(0, (-1, 3))).sum(1) / springs.length[:, None]
     part.stiffness = part.stiffness + along.mT @ (((times - 1) * part.factor * springs.stiffness)[:, None] * along)
     part.factor, part.damping = times * part.factor, torch.zeros_like(part.damping)

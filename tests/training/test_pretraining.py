@@ -31,8 +31,9 @@ from gausim.training.pretraining import give_even_material
 
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
-    "model.simulator.template.spacing=0.2", "model.simulator.network.hidden=8", "model.simulator.network.layers=1",
-    "data.held_out=1", "data.batch_size=2", "data.curriculum.t_start=2", "data.curriculum.t_max=4", "logger=none",
+    "model.simulator.template.solid.spacing=0.2", "model.simulator.network.hidden=8",
+    "model.simulator.network.layers=1", "data.held_out=1", "data.batch_size=2",
+    "data.curriculum.t_start=2", "data.curriculum.t_max=4", "logger=none",
 )  # fmt: skip
 
 

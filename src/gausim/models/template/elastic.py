@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.solid import solid_body
+from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.models.template.springs import unit_springs
 from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template, force_of_strain
 
@@ -45,8 +45,7 @@ class ElasticScene(nn.Module):
     def __init__(
         self,
         hierarchy: Hierarchy, finest: int, *,
-        modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: float,
-        held_inside: bool = False,
+        modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: SolidSettings | float,
     ) -> None:  # fmt: skip
         """Initialises from ``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric``."""
         super().__init__()
@@ -56,9 +55,11 @@ class ElasticScene(nn.Module):
         mass = mass / mass.mean()
         pinned = level.pinned.numpy()
         finer = hierarchy.levels[0]
-        kernels, spacing = finer.rest.double().numpy(), solid * hierarchy.diagonal
-        held = finer.pinned.numpy()
-        body = solid_body(kernels, held, rest, mass, pinned, modes=modes, spacing=spacing, inside=held_inside)
+        kernels, held, solid = finer.rest.double().numpy(), finer.pinned.numpy(), SolidSettings.of(solid)
+        body = solid_body(
+            kernels, held, rest, mass, pinned,
+            modes=modes, spacing=solid.spacing * hierarchy.diagonal, inside=solid.held_inside,
+        )  # fmt: skip
         values, phi, slopes, strains = body.of_units(rest, pinned)
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
@@ -136,7 +137,7 @@ class PreparedElastic(ModalScene):
     def __init__(self, scene: ElasticScene) -> None:
         """Computes the constants; loss gradients flow through them."""
         super().__init__(scene.projection, scene.modes, scene.gradients)
-        self.scene, self.springs = scene, scene.springs
+        self.scene, self.nonlinear = scene, scene.springs
         self.factor = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
         root, (stretch, mixing) = scene.inertia_root(), scene.roots()
         pull = (stretch[:, None] * mixing).mT @ root
@@ -167,8 +168,7 @@ class ElasticTemplate(Template):
         period: float = 8.0,
         amplitude: float = 0.02,
         geometric: float = 1.0,
-        solid: float = 0.12,
-        held_inside: bool = False,
+        solid: SolidSettings | float = 0.12,
         attributes: int = 0,
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
@@ -183,8 +183,7 @@ class ElasticTemplate(Template):
             period: initial period of the lowest mode [frames].
             amplitude: typical displacement [diagonals], the size of initial velocities.
             geometric: initial factor on the springs' nonlinear force, trained.
-            solid: spacing of the grid on which the modes of the body around the kernels are computed [diagonals].
-            held_inside: hold what is nearest to pinned kernels within the body, too (runs of before do not).
+            solid: the solid body; a number stands for the spacing of its grid [diagonals].
             attributes: number of attributes per unit, unused: the material of a scene is in its matrices.
             frames: axes of the scenes, unused.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
@@ -194,7 +193,7 @@ class ElasticTemplate(Template):
         self.scenes = nn.ModuleList(
             ElasticScene(
                 h, finest, modes=modes, neighbours=neighbours, period=period, amplitude=amplitude,
-                geometric=geometric, solid=solid, held_inside=held_inside,
+                geometric=geometric, solid=solid,
             )
             for h in hierarchies
         )  # fmt: skip

@@ -23,9 +23,9 @@ velocity round instead of stopping it. What is nonlinear are either the cells of
 (finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
 :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
 the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
-common (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded values, so
-that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for
-the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
+common (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded
+values, so that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too
+fast for the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
 orientations.
 """
 
@@ -34,6 +34,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -94,8 +95,10 @@ class BodyModes(nn.Module):
     cells: FiniteStrain | None  # of the homogeneous body, if its strain is finite
 
     def __init__(
-        self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, solid: SolidSettings, links: int
-    ) -> None:
+        self,
+        hierarchy: Hierarchy, finest: int, frame: np.ndarray, *,
+        modes: int, solid: SolidSettings, links: int, finite: bool,
+    ) -> None:  # fmt: skip
         """Computes the constants in the axes ``frame`` (3, 3) of the body; see :class:`MaterialTemplate`."""
         super().__init__()
         level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
@@ -103,7 +106,7 @@ class BodyModes(nn.Module):
         mass = level.volume.double().numpy()
         mass = mass / mass[~pinned].mean()
         own = kernels.rest.double().numpy() @ frame.T
-        size, finite = solid.spacing * hierarchy.diagonal, solid.finite_strain
+        size = solid.spacing * hierarchy.diagonal
         body = solid_body(
             own, kernels.pinned.numpy(), rest, mass, pinned,
             modes=modes, spacing=size, inside=solid.held_inside, curved=CURVED if finite else 0,
@@ -198,6 +201,7 @@ class MaterialTemplate(Template):
         modes: int = 48,
         solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
+        finite_strain: bool = False,
         hidden: int = 48,
         period: float = 8.0,
         damping: float = 0.02,
@@ -213,6 +217,7 @@ class MaterialTemplate(Template):
             modes: number of modes.
             solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
+            finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
@@ -228,11 +233,11 @@ class MaterialTemplate(Template):
             )
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
-        solid = solid if isinstance(solid, SolidSettings) else SolidSettings(solid)
-        self.bodies = nn.ModuleList(
-            BodyModes(h, finest, f, modes=modes, solid=solid, links=self.links.neighbours)
-            for h, f in zip(hierarchies, frames, strict=True)
-        )
+        made = partial(
+            BodyModes, finest=finest, modes=modes, solid=SolidSettings.of(solid), links=self.links.neighbours,
+            finite=finite_strain,
+        )  # fmt: skip
+        self.bodies = nn.ModuleList(made(h, frame=f) for h, f in zip(hierarchies, frames, strict=True))
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 3))
@@ -353,10 +358,9 @@ class PreparedMaterial(ModalScene):
         self.matrices, self.positions = matrices, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
-        self.springs, self.factor = body.springs, matrices.springs
+        self.nonlinear, self.factor, self.growth = body.springs, matrices.springs, matrices.growth
         if body.cells is not None:
-            self.springs, self.factor, self.corrections = body.cells, matrices.units, 4
-        self.spring_damping = matrices.growth
+            self.nonlinear, self.factor, self.corrections = body.cells, matrices.units, 4
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.

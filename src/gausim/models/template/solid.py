@@ -142,11 +142,15 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
 
 @dataclass(frozen=True)
 class SolidSettings:
-    """How the body around the kernels is modelled; runs that name no more than ``spacing`` have these defaults."""
+    """How the body around the kernels is modelled; a number in the place of these stands for ``spacing``."""
 
     spacing: float = 0.12  # of the grid [diagonals]
-    held_inside: bool = False  # pinned kernels hold what is within the body beside them, too
-    finite_strain: bool = False  # of the body's cells; else the springs between units are what is nonlinear
+    held_inside: bool = False  # pinned kernels hold what is within the body beside them, too; not in earlier runs
+
+    @classmethod
+    def of(cls, solid: SolidSettings | float) -> SolidSettings:
+        """The settings that a number stands for."""
+        return solid if isinstance(solid, SolidSettings) else cls(solid)
 
 
 @dataclass(frozen=True, eq=False)

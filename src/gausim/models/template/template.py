@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -20,9 +21,7 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.solid import FIRST, SECOND
-from gausim.models.template.springs import Springs
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
@@ -153,15 +152,37 @@ class Template(nn.Module, ABC):
         return None
 
 
+class NonlinearForce(Protocol):
+    """What a body's forces are beyond those of small displacements (:mod:`gausim.models.template.springs`)."""
+
+    def strained(self, strain: Tensor) -> Tensor:
+        """What a strain (S, N, 9) of the reference changes."""
+
+    def stretched(self, z: Tensor, taut: Tensor | None = None) -> Any:
+        """The body in a state of the modes (S, M)."""
+
+    def between(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
+        """Mean force (S, M) from one state to another."""
+
+    def stiffening(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
+        """By how much it makes the body stiffer (S, M, M)."""
+
+    def potential(self, state: Any, factor: Tensor) -> Tensor:
+        """Potential energy (S,)."""
+
+    def dissipated(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float) -> Tensor:
+        """Energy (S,) that the damping takes."""
+
+
 class ModalScene:
     """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
     inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
     stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
     damping: Float[Tensor, "M M"]  # modal damping
-    springs: Springs | FiniteStrain  # nonlinear
-    factor: Tensor  # on the springs' stiffness, of all or of each (E,); of the solid's shear and volume (N, 2)
-    spring_damping: Tensor | float = 0.0  # of the springs' lengths or the solid's strains, over stiffness [frames]
+    nonlinear: NonlinearForce  # of springs, or of finite strain
+    factor: Tensor  # on its stiffness: of the springs, one or one of each (E,); of the units' shear and volume (N, 2)
+    growth: Tensor | float = 0.0  # resistance to the growth of length or strain over that to it [frames]
     # Corrections of a step; for all but the last stiffness is computed. The first is that of the state at the start. It
     # misses how far the body turns within the frame: where it is far stiffer than inertia, corrections with it alone do
     # not converge. With the others, between the ends of the frame, they do.
@@ -206,29 +227,29 @@ class ModalScene:
     ) -> Float[Tensor, "S M"]:
         """z_{t+1}, under a load (:class:`gausim.models.reference.reference.UnitMotion`).
 
-        A step of the trapezoidal rule, with the mean f of the springs' force between m_- = (z_t + z_{t-1}) / 2 and
+        A step of the trapezoidal rule, with the mean f of the nonlinear force between m_- = (z_t + z_{t-1}) / 2 and
         m_+ = (z_{t+1} + z_t) / 2:
 
             M (z_{t+1} - 2 z_t + z_{t-1}) = f(m_-, m_+) - K (m_- + m_+) / 2 - D (z_{t+1} - z_{t-1}) / 2 + load
 
-        The springs' damping is part of f. Without damping and load a step conserves :meth:`energy` exactly. It is
+        Resistance to growth is part of f. Without damping and load a step conserves :meth:`energy` exactly. It is
         solved by corrections; loss gradients are theirs.
         """
-        springs, factor, damping = self.springs, self.factor, self.spring_damping
+        law, factor, damping = self.nonlinear, self.factor, self.growth
         speed, bend = z - previous, torch.zeros_like(z)
         taut, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
         if load is not None:
-            taut, force = springs.strained(load[..., 3:]), force + self.force(load)
+            taut, force = law.strained(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first, now = springs.stretched(z - speed / 2, taut), springs.stretched(z, taut)
+        first, now = law.stretched(z - speed / 2, taut), law.stretched(z, taut)
         for correction in range(self.corrections):
-            second = springs.stretched(z + (speed + bend) / 2, taut)
+            second = law.stretched(z + (speed + bend) / 2, taut)
             if correction < self.corrections - 1:
                 with torch.no_grad():
                     ends = (first, second) if correction else (now, now)
-                    operator = linear + springs.stiffening(*ends, factor, damping) / 4
+                    operator = linear + law.stiffening(*ends, factor, damping) / 4
                     inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
-            nonlinear = springs.between(first, second, factor, damping)
+            nonlinear = law.between(first, second, factor, damping)
             bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
         return z + speed + bend
 
@@ -249,22 +270,22 @@ class ModalScene:
         return (held.mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 + the springs' nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
+        """v^T M v / 2 + m^T K m / 2 + the nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
 
         Only the state receives loss gradients.
         """
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness, factor = self.inertia.detach(), self.stiffness.detach(), self.factor.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.springs.potential(self.springs.stretched(middle), factor)
+        return energy + self.nonlinear.potential(self.nonlinear.stretched(middle), factor)
 
     def dissipated(
         self, after: Float[Tensor, "S M"], now: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]
     ) -> Float[Tensor, " S"]:
-        """Energy lost to damping in a step: v^T D v of v = (z_{t+1} - z_{t-1}) / 2, and what the springs' takes."""
-        speed, springs = (after - previous) / 2, self.springs
-        first, second = (springs.stretched((now + end) / 2) for end in (previous, after))
-        taken = springs.dissipated(first, second, self.factor, self.spring_damping)
+        """Energy lost to damping in a step: v^T D v of v = (z_{t+1} - z_{t-1}) / 2, and to growth."""
+        speed, law = (after - previous) / 2, self.nonlinear
+        first, second = (law.stretched((now + end) / 2) for end in (previous, after))
+        taken = law.dissipated(first, second, self.factor, self.growth)
         return ((speed @ self.damping) * speed).sum(-1) + taken
 
 
