@@ -71,7 +71,7 @@ def test_a_run_killed_again_and_again_equals_an_uninterrupted_one(trainings: Tra
 @pytest.mark.parametrize("kind", ["falling", "held"])
 def test_a_moving_body_killed_again_and_again_equals_an_uninterrupted_one(trainings: Trainings, kind: str) -> None:
     template = "model.simulator.template"
-    settings = (*THREE, "model=gausim", trainings.moving(kind), f"{template}.modes=6", f"{template}.spacing=0.3",
+    settings = (*THREE, "model=gausim", trainings.moving(kind), f"{template}.modes=6", f"{template}.solid.spacing=0.3",
                 "callbacks.checkpoint.every_steps=2")  # fmt: skip
     whole, run = trainings.whole(f"whole_{kind}", *settings), trainings.run(kind)
     for deaths, death in enumerate((killed(STEP, 2), killed(SAVED, 2), killed(STEP, 3, when="after"), killed(STEP, 4))):
