@@ -78,9 +78,14 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
         tied = 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
         inertia, drag = inertia + tied, drag + lost[body.springs.ends[:, e]].sum() * tied
     torch.testing.assert_close(found.stiffness, k * stiffness)
-    torch.testing.assert_close(found.inertia, inertia)
-    viscosity = c1 + drag.trace() / inertia.trace() / 4
-    torch.testing.assert_close(found.damping, drag + viscosity * k * stiffness)
+    torch.testing.assert_close(found.mass, inertia)
+    slowed = (found.inertia - inertia).diagonal()
+    torch.testing.assert_close(found.inertia, inertia + slowed.diag())
+    fastest = k * stiffness.diagonal() / (4 * np.pi) ** 2  # two swings a frame
+    torch.testing.assert_close(inertia.diagonal() + slowed, torch.maximum(inertia.diagonal(), fastest))
+    assert 0 < int((slowed > 0).sum()) < 9
+    rate = drag.trace() / inertia.trace()
+    torch.testing.assert_close(found.damping, drag + rate * slowed.diag() + (c1 + rate / 4) * k * stiffness)
     torch.testing.assert_close(found.springs, 0.15 * k * links[:, 2].exp())
     torch.testing.assert_close(found.units, k * units[:, :2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
@@ -117,7 +122,7 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
     template, (density, attributes) = _template(hierarchy), _material(hierarchy)
     fast, slow = (template.matrices(0, density, attributes, dt) for dt in (1 / 48, 1 / 24))
     torch.testing.assert_close(slow.stiffness, 4 * fast.stiffness)
-    torch.testing.assert_close(slow.inertia, fast.inertia)
+    torch.testing.assert_close(slow.mass, fast.mass)
 
 
 @pytest.mark.parametrize("frames", [24, 48])
@@ -142,7 +147,7 @@ def test_a_load_acts_on_the_learned_masses() -> None:
     part, a = neural_model().modal_scene(0), torch.randn(3, 9, generator=torch.Generator().manual_seed(4)).double()
     accelerations = (a @ part.positions.mT).view(3, -1, 3)
     load = torch.cat((accelerations, accelerations.new_zeros(*accelerations.shape[:2], 9)), -1)
-    torch.testing.assert_close(part.force(load), a @ part.inertia.mT, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(part.force(load), a @ part.mass.mT, atol=1e-5, rtol=1e-5)
 
 
 def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous_one(hierarchy) -> None:

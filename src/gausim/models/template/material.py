@@ -23,10 +23,12 @@ velocity round instead of stopping it. What is nonlinear are either the cells of
 (finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
 :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
 the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
-common (:class:`gausim.models.template.template.ModalScene`). K, M and D are positive semi-definite for all decoded
-values, so that a step never creates energy, and without damping it conserves energy. It does not amplify vibrations too
-fast for the frame rate. The decoders' only geometric input are distances, so that they generalise to other bodies and
-orientations.
+common (:class:`gausim.models.template.template.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
+where a step can neither follow nor damp them and they tremble on. What they do is to follow other modes, and they still
+do with inertia max(0, K_mm / w^2 - M_mm) more, with which none swings faster than w, twice in a frame. K, M and D are
+positive semi-definite for all decoded values, so that a step never creates energy, and without damping it conserves
+energy. It does not amplify vibrations too fast for the frame rate. The decoders' only geometric input are distances, so
+that they generalise to other bodies and orientations.
 """
 
 from __future__ import annotations
@@ -55,6 +57,8 @@ from gausim.nn.mlp import mlp
 LARGEST_LOG = 2.5
 # Lowest modes of which derivatives are among the modes of a body with finite strain: 21 of 48.
 CURVED = 6
+# Largest angular frequency of a mode of a body with finite strain: two swings a frame [1 / frame].
+FASTEST = 4 * math.pi
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
@@ -173,7 +177,8 @@ class Matrices:
     """Matrices of the dynamics of one scene [frame units]."""
 
     stiffness: Float[Tensor, "M M"]  # K (M, M)
-    inertia: Float[Tensor, "M M"]  # M (M, M)
+    mass: Float[Tensor, "M M"]  # M (M, M)
+    inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
     springs: Float[Tensor, " E"]  # k e^{g_ij} of every link, in units of S_ij (E,)
@@ -283,13 +288,18 @@ class MaterialTemplate(Template):
         root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
         inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
         lost = (drag * frame * units[:, 2].exp()).div(2).tanh()
-        slowed = sum(lost.index_select(0, end) for end in body.springs.ends)[:, None, None]  # twice a link's mean
+        loss = sum(lost.index_select(0, end) for end in body.springs.ends)[:, None, None]  # twice a link's mean
         dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
-        dragged = dragged + body.between.flatten(0, 1).mT @ (slowed * tied).flatten(0, 1)
-        damping = dragged + (dragged.trace() / inertia.trace() / 4 + viscosity / frame) * k * stiffness
+        dragged = dragged + body.between.flatten(0, 1).mT @ (loss * tied).flatten(0, 1)
+        rate = dragged.trace() / inertia.trace()
+        mass = inertia
+        if body.cells is not None:
+            slowed = ((k * stiffness).diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
+            inertia, dragged = mass + slowed, dragged + rate * slowed
+        damping = dragged + (rate / 4 + viscosity / frame) * k * stiffness
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
         return Matrices(
-            k * stiffness, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1), tense,
+            k * stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1), tense,
             self.links.damping / frame,
         )  # fmt: skip
 
@@ -357,7 +367,8 @@ class PreparedMaterial(ModalScene):
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.positions = matrices, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
-        self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
+        self.mass, self.inertia = matrices.mass, matrices.inertia
+        self.stiffness, self.damping = matrices.stiffness, matrices.damping
         self.nonlinear, self.factor, self.growth = body.springs, matrices.springs, matrices.growth
         if body.cells is not None:
             self.nonlinear, self.factor, self.corrections = body.cells, matrices.units, 4
@@ -382,7 +393,7 @@ class PreparedMaterial(ModalScene):
         is reduced as the trapezoidal rule reduces their pull.
         """
         reference = self.reference * self.values.sum()
-        pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
+        pace = self.matrices.stiffness.trace() / self.mass.trace() * len(self.values) / reference
         return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:

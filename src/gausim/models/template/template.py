@@ -177,7 +177,8 @@ class NonlinearForce(Protocol):
 class ModalScene:
     """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
-    inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
+    mass: Float[Tensor, "M M"]  # modal mass [frame units]
+    inertia: Float[Tensor, "M M"]  # modal inertia: the mass, but where a template slows modes too fast for frames
     stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
     damping: Float[Tensor, "M M"]  # modal damping
     nonlinear: NonlinearForce  # of springs, or of finite strain
@@ -205,7 +206,7 @@ class ModalScene:
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
         """Modal force of a load; here Phi^T M a of the part of its accelerations a that is within the modes."""
-        return (load[..., :3].flatten(1) @ self.projection) @ self.inertia.mT
+        return (load[..., :3].flatten(1) @ self.projection) @ self.mass.mT
 
     def coordinates(
         self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]
@@ -256,7 +257,7 @@ class ModalScene:
     def withheld(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """The part of a displacement by an impulse that its frame does not reach.
 
-        Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t).
+        Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t), M after the inverse being the mass.
         A mode of angular frequency w that gets a velocity v thus begins with v / (1 + w^2 / 4), with which a motion of
         the trapezoidal rule is as large as the true one, v / w. With all of v modes far above the frame rate would turn
         round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
@@ -266,7 +267,7 @@ class ModalScene:
         inverse, slow = (torch.linalg.inv_ex(a)[0] for a in (whole, self.stiffness))  # without waiting for a device
         lost = (slow * self.damping).sum() / (2 * (slow * whole).sum())
         z = (displacement.flatten(1) @ self.projection).mT
-        held = z - inverse @ self.inertia @ z / (1 - lost).clamp_min(LEAST_LEFT)
+        held = z - inverse @ self.mass @ z / (1 - lost).clamp_min(LEAST_LEFT)
         return (held.mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
@@ -342,7 +343,7 @@ class PreparedScenes(PreparedTemplate):
         """How a member yields to impulses: by the modes of its scene."""
         part = next(part for part, _, members in self.parts if member in members)
         modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
-        mass = part.inertia.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
+        mass = part.mass.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
         return modes, slopes.unflatten(1, (3, 3)), (part.inertia, part.stiffness, part.damping), mass
 
     def carried(self, motion: Motion) -> Motion:
