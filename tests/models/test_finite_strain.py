@@ -8,7 +8,8 @@ import torch
 from helpers.bodies import pull_of
 
 from gausim.models.template.finite_strain import FiniteStrain
-from gausim.models.template.solid import FIRST, SECOND, solid_body
+from gausim.models.template.grid import FIRST, SECOND
+from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
 
 

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gausim.models.template import grid as grids
 from gausim.models.template import solid
 
 
@@ -18,11 +19,11 @@ def _shell(size: tuple[float, float, float], step: float) -> np.ndarray:
 
 
 @pytest.fixture
-def grid() -> solid.Grid:
-    return solid.Grid(np.array([-1.0, 0.5, 2.0]), 0.25, (9, 10, 11))
+def grid() -> grids.Grid:
+    return grids.Grid(np.array([-1.0, 0.5, 2.0]), 0.25, (9, 10, 11))
 
 
-def test_splines_reproduce_linear_fields_and_their_gradients(grid: solid.Grid) -> None:
+def test_splines_reproduce_linear_fields_and_their_gradients(grid: grids.Grid) -> None:
     rng = np.random.default_rng(0)
     points = grid.origin + 0.25 * rng.uniform(2, 6, (50, 3))
     nodes, weights, gradients = grid.splines(points)
@@ -39,21 +40,21 @@ def test_splines_reproduce_linear_fields_and_their_gradients(grid: solid.Grid) -
 def test_the_inside_of_a_closed_shell_is_body_and_a_sheet_stays_a_sheet() -> None:
     shell = np.ones((9, 9, 9), dtype=bool)
     shell[1:-1, 1:-1, 1:-1] = False
-    assert solid.inside(shell).all()
+    assert grids.inside(shell).all()
     sheet = np.zeros((9, 9, 9), dtype=bool)
     sheet[:, :, 4] = True
-    np.testing.assert_array_equal(solid.inside(sheet), sheet)
+    np.testing.assert_array_equal(grids.inside(sheet), sheet)
 
 
 def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
     points = _shell((1.0, 0.8, 0.6), 0.1)
-    grid, centres, weights = solid.cells(points, 0.2)
-    blocks = solid.stiffness(grid, centres, weights)
+    grid, centres, weights = grids.cells(points, 0.2)
+    blocks = grids.stiffness(grid, centres, weights)
     nodes = grid.origin + grid.spacing * np.stack(np.unravel_index(np.arange(grid.size), grid.shape), -1)
     slope = np.random.default_rng(1).normal(size=(3, 3))
     field = nodes @ slope.T
     energy = sum(field[:, a] @ (blocks[a][b] @ field[:, b]) for a in range(3) for b in range(3)) / 2
-    strain, nu = (slope + slope.T) / 2, solid.POISSON
+    strain, nu = (slope + slope.T) / 2, grids.POISSON
     first, second = nu / ((1 + nu) * (1 - 2 * nu)), 1 / (2 * (1 + nu))
     expected = (first / 2 * np.trace(strain) ** 2 + second * (strain**2).sum()) * weights.sum()
     assert energy == pytest.approx(expected, rel=1e-9)
@@ -141,8 +142,8 @@ def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:
 
 def test_cells_do_not_depend_on_rounding() -> None:
     points = np.random.default_rng(0).random((60, 3))
-    _, centres, weights = solid.cells(points, 0.3)
+    _, centres, weights = grids.cells(points, 0.3)
     for shift in np.linspace(0.1, 7.7, 20):  # the outermost points lie on borders of cells
-        _, moved, same = solid.cells(points + shift, 0.3)
+        _, moved, same = grids.cells(points + shift, 0.3)
         assert np.array_equal(weights, same)
         np.testing.assert_allclose(moved - shift, centres, atol=1e-12)

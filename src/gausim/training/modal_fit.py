@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.models.step.scene_model import SceneModel
-from gausim.models.template.template import ModalScene
+from gausim.models.template.modal import ModalScene
 from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
 
 # Predicted frames in the first update, and fraction of the updates over which T grows.

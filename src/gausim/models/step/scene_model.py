@@ -22,15 +22,9 @@ from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
 from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
+from gausim.models.template.modal import ModalScene
 from gausim.models.template.smooth import smooth_motions
-from gausim.models.template.template import (
-    ModalScene,
-    Motion,
-    PreparedScenes,
-    PreparedTemplate,
-    Property,
-    Template,
-)
+from gausim.models.template.template import Motion, PreparedScenes, PreparedTemplate, Property, Template
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -163,7 +157,7 @@ class SceneModel(nn.Module, ABC):
         """The state after a force on free kernels has acted on it for a frame.
 
         The paper's is x_t + f dt^2 / (2 m). In templates with modes x_{t-1} gives the same velocity, f dt / m, less
-        what is withheld from it within the frame (:meth:`gausim.models.template.template.ModalScene.withheld`).
+        what is withheld from it within the frame (:meth:`gausim.models.template.modal.ModalScene.withheld`).
         """
         batch = prepared.batch
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])

@@ -2,7 +2,7 @@
 
 With u the displacement of the units and Phi the lowest mass-orthonormal modes of the body that the kernels bound,
 z = Phi^T M u obeys z'' + D z' + K z = f(z), f being the nonlinear part of the force of springs between the units. A
-frame is the step that all modal templates have in common (:class:`gausim.models.template.template.ModalScene`), which
+frame is the step that all modal templates have in common (:class:`gausim.models.template.modal.ModalScene`), which
 creates no energy whatever positive semi-definite K and D are. They are trained as products S L L^T S around the body's
 spectrum, so that the modes may mix. Trained inertia allows masses that differ from the units' volumes: z above is
 replaced by H z with a trained matrix H, hence inertia H^T H.
@@ -22,9 +22,10 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.template.modal import ModalScene, force_of_strain
 from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.models.template.springs import unit_springs
-from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template, force_of_strain
+from gausim.models.template.template import PreparedScenes, Property, Template
 
 # Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
 # modes.

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.models.template.solid import FIRST, SECOND
+from gausim.models.template.grid import FIRST, SECOND
 
 
 class Strained(NamedTuple):

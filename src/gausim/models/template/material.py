@@ -23,7 +23,7 @@ velocity round instead of stopping it. What is nonlinear are either the cells of
 (finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
 :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
 the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
-common (:class:`gausim.models.template.template.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
+common (:class:`gausim.models.template.modal.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
 where a step can neither follow nor damp them and they tremble on. What they do is to follow other modes, and they still
 do with inertia max(0, K_mm / w^2 - M_mm) more, with which none swings faster than w, twice in a frame. K, M and D are
 positive semi-definite for all decoded values, so that a step never creates energy, and without damping it conserves
@@ -48,9 +48,10 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.finite_strain import FiniteStrain
-from gausim.models.template.solid import FIRST, SECOND, SolidBody, SolidSettings, solid_body
+from gausim.models.template.modal import ModalScene, force_of_strain
+from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
-from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template, force_of_strain
+from gausim.models.template.template import DENSITY, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
 
 # Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
@@ -133,7 +134,7 @@ class BodyModes(nn.Module):
             "gradients": slope,
             "projection": phi * mass[:, None, None],
             "values": values,
-            "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
+            "stiffness": body.cell_stiffness(rest, pinned) / lowest,
             "strain": body.strains(rest),
             "inertia": phi * np.sqrt(mass)[:, None, None],
             "stretch": even * stretch,
@@ -152,24 +153,6 @@ def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
     pairs = neighbour_pairs(rest, count)
     distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
     return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
-
-
-def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
-    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included."""
-    strain = body.cell_strain
-    trace, count = np.trace(strain, axis1=1, axis2=2), strain.shape[-1]
-    # Components per cell and mode whose squares sum to twice the energy: nine of shear, one of volume.
-    parts = math.sqrt(2 * SECOND) * strain.reshape(-1, 9, count), math.sqrt(FIRST) * trace[:, None]
-    found = np.zeros((2, len(rest), count, count))
-    for unit, share in enumerate(body.shares(rest)):
-        size = np.sqrt(share.data)[:, None, None]
-        for total, roots in zip(found, parts, strict=True):
-            part = (roots[share.indices] * size).reshape(-1, count)
-            total[unit] = part.T @ part
-    missing = np.diag(body.values) - found.sum((0, 1))  # the springs that hold the pins, and rounding
-    free = ~pinned
-    found[0, free] += missing / free.sum()
-    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -21,13 +20,11 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.solid import FIRST, SECOND
+from gausim.models.template.modal import ModalScene
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
-# Least part of an impulse that damping leaves in its first frame.
-LEAST_LEFT = 0.1
 DENSITY = "density over that at the beginning of training"
 
 
@@ -150,160 +147,6 @@ class Template(nn.Module, ABC):
         See :class:`gausim.core.SmoothMotions`.
         """
         return None
-
-
-class NonlinearForce(Protocol):
-    """What a body's forces are beyond those of small displacements (:mod:`gausim.models.template.springs`)."""
-
-    def strained(self, strain: Tensor) -> Tensor:
-        """What a strain (S, N, 9) of the reference changes."""
-
-    def stretched(self, z: Tensor, taut: Tensor | None = None) -> Any:
-        """The body in a state of the modes (S, M)."""
-
-    def between(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
-        """Mean force (S, M) from one state to another."""
-
-    def stiffening(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
-        """By how much it makes the body stiffer (S, M, M)."""
-
-    def potential(self, state: Any, factor: Tensor) -> Tensor:
-        """Potential energy (S,)."""
-
-    def dissipated(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float) -> Tensor:
-        """Energy (S,) that the damping takes."""
-
-
-class ModalScene:
-    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
-
-    mass: Float[Tensor, "M M"]  # modal mass [frame units]
-    inertia: Float[Tensor, "M M"]  # modal inertia: the mass, but where a template slows modes too fast for frames
-    stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
-    damping: Float[Tensor, "M M"]  # modal damping
-    nonlinear: NonlinearForce  # of springs, or of finite strain
-    factor: Tensor  # on its stiffness: of the springs, one or one of each (E,); of the units' shear and volume (N, 2)
-    growth: Tensor | float = 0.0  # resistance to the growth of length or strain over that to it [frames]
-    # Corrections of a step; for all but the last stiffness is computed. The first is that of the state at the start. It
-    # misses how far the body turns within the frame: where it is far stiffer than inertia, corrections with it alone do
-    # not converge. With the others, between the ends of the frame, they do.
-    corrections = 3
-
-    def __init__(
-        self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
-    ) -> None:
-        """Stores the map from displacements to z, and those from z to displacements and displacement gradients."""
-        self.projection = projection.flatten(0, 1)
-        # Displacements and displacement gradients of a unit side by side: one product gives both.
-        self.motions = torch.cat((modes, gradients.flatten(1, 2)), 1).flatten(0, 1)
-
-    def __call__(
-        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], load: Float[Tensor, "S N 12"] | None = None
-    ) -> Float[Tensor, "S N 12"]:
-        """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
-        after = self.after(*self.coordinates(now, before), load)
-        return (after @ self.motions.mT).view(*now.shape[:2], 12)
-
-    def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
-        """Modal force of a load; here Phi^T M a of the part of its accelerations a that is within the modes."""
-        return (load[..., :3].flatten(1) @ self.projection) @ self.mass.mT
-
-    def coordinates(
-        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]
-    ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
-        """z_t and z_{t-1}."""
-        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
-        return z, previous
-
-    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """The part of a displacement that is input to template and network; here all of it."""
-        return displacement
-
-    def correction_unit(self) -> Float[Tensor, ""] | None:
-        """Factor on the network's output; None for a factor of 1."""
-        return None
-
-    def after(
-        self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"], load: Float[Tensor, "S N 12"] | None = None
-    ) -> Float[Tensor, "S M"]:
-        """z_{t+1}, under a load (:class:`gausim.models.reference.reference.UnitMotion`).
-
-        A step of the trapezoidal rule, with the mean f of the nonlinear force between m_- = (z_t + z_{t-1}) / 2 and
-        m_+ = (z_{t+1} + z_t) / 2:
-
-            M (z_{t+1} - 2 z_t + z_{t-1}) = f(m_-, m_+) - K (m_- + m_+) / 2 - D (z_{t+1} - z_{t-1}) / 2 + load
-
-        Resistance to growth is part of f. Without damping and load a step conserves :meth:`energy` exactly. It is
-        solved by corrections; loss gradients are theirs.
-        """
-        law, factor, damping = self.nonlinear, self.factor, self.growth
-        speed, bend = z - previous, torch.zeros_like(z)
-        taut, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
-        if load is not None:
-            taut, force = law.strained(load[..., 3:]), force + self.force(load)
-        linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first, now = law.stretched(z - speed / 2, taut), law.stretched(z, taut)
-        for correction in range(self.corrections):
-            second = law.stretched(z + (speed + bend) / 2, taut)
-            if correction < self.corrections - 1:
-                with torch.no_grad():
-                    ends = (first, second) if correction else (now, now)
-                    operator = linear + law.stiffening(*ends, factor, damping) / 4
-                    inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
-            nonlinear = law.between(first, second, factor, damping)
-            bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
-        return z + speed + bend
-
-    def withheld(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """The part of a displacement by an impulse that its frame does not reach.
-
-        Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t), M after the inverse being the mass.
-        A mode of angular frequency w that gets a velocity v thus begins with v / (1 + w^2 / 4), with which a motion of
-        the trapezoidal rule is as large as the true one, v / w. With all of v modes far above the frame rate would turn
-        round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
-        steady force ends where stiffness balances it.
-        """
-        whole = self.inertia + self.stiffness / 4
-        inverse, slow = (torch.linalg.inv_ex(a)[0] for a in (whole, self.stiffness))  # without waiting for a device
-        lost = (slow * self.damping).sum() / (2 * (slow * whole).sum())
-        z = (displacement.flatten(1) @ self.projection).mT
-        held = z - inverse @ self.mass @ z / (1 - lost).clamp_min(LEAST_LEFT)
-        return (held.mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
-
-    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 + the nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
-
-        Only the state receives loss gradients.
-        """
-        step, middle = z - previous, (z + previous) / 2
-        inertia, stiffness, factor = self.inertia.detach(), self.stiffness.detach(), self.factor.detach()
-        energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.nonlinear.potential(self.nonlinear.stretched(middle), factor)
-
-    def dissipated(
-        self, after: Float[Tensor, "S M"], now: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]
-    ) -> Float[Tensor, " S"]:
-        """Energy lost to damping in a step: v^T D v of v = (z_{t+1} - z_{t-1}) / 2, and to growth."""
-        speed, law = (after - previous) / 2, self.nonlinear
-        first, second = (law.stretched((now + end) / 2) for end in (previous, after))
-        taken = law.dissipated(first, second, self.factor, self.growth)
-        return ((speed @ self.damping) * speed).sum(-1) + taken
-
-
-def force_of_strain(
-    strain: Float[Tensor, "S N 9"], uneven: Float[Tensor, "N 2"], modes: Float[Tensor, "N 9 M"]
-) -> Float[Tensor, "S M"]:
-    """-sum_n (2 mu u_n0 S_n + lambda u_n1 tr S_n) : E_n, the modal force of a strain S of the reference.
-
-    Args:
-        strain: displacement gradient S of every unit, row by row; its antisymmetric part does nothing.
-        uneven: stiffness of shear and of volume beyond that of the homogeneous body [1 / frame^2].
-        modes: E, strain of the modes near each unit times volume, as ``SolidBody.strains`` gives it.
-    """
-    shear, volume = uneven.unbind(-1)
-    trace = strain[..., ::4].sum(-1) * (FIRST * volume)
-    stress = 2 * SECOND * shear[:, None] * strain + trace[..., None] * torch.eye(3).to(strain).flatten()
-    return -stress.flatten(1) @ modes.flatten(0, 1)
 
 
 class PreparedScenes(PreparedTemplate):
