@@ -6,8 +6,8 @@ theta_g, and a homogeneous elastic body follows by the static modes Psi of compo
 
     a(X) = c + B (X - o + sum_g Psi_g(X) (d_g, theta_g)),    A = grad a.
 
-All that the body does besides is relative to a and in the axes B, common to all units. The springs between units
-(:mod:`gausim.models.template.springs`), whose energy is that of their lengths at any rotation, start from B^T A.
+All that the body does besides is relative to a and in the axes B, common to all units. What is nonlinear, finite strain
+or the lengths of springs between units (:mod:`gausim.models.template`), knows no rotation and starts from B^T A.
 """
 
 from __future__ import annotations
