@@ -122,8 +122,7 @@ class OptimizerSettings:
 
     def slower(self, factor: float) -> OptimizerSettings:
         """The same with rates times ``factor``."""
-        names = ("network_lr", "scene_lr", "template_lr", "initial_lr")
-        rates = {name: getattr(self, name) for name in names}
+        rates = {name: getattr(self, name) for name in (f"{group}_lr" for group in GROUPS)}
         return replace(self, **{name: factor * rate for name, rate in rates.items() if rate is not None})
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:

@@ -12,6 +12,14 @@ from torch import Tensor, nn
 from gausim.models.template.grid import FIRST, SECOND
 
 
+def hooke(strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
+    """2 mu s E + lambda b tr(E) I of strains E, s and b the ``factor`` on stiffness of shear and of volume."""
+    shear, bulk = factor.unbind(-1)
+    pressure = FIRST * bulk * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
+    one = torch.eye(3, dtype=strain.dtype, device=strain.device)
+    return 2 * SECOND * shear[:, None, None] * strain + pressure[..., None, None] * one
+
+
 class Strained(NamedTuple):
     """The body in a state."""
 
@@ -115,7 +123,4 @@ class FiniteStrain(nn.Module):
 
     def _stress(self, strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
         """Hooke's stress of a strain, times volume."""
-        shear, bulk = (self.volume[:, None] * factor).unbind(-1)
-        pressure = FIRST * bulk * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
-        one = torch.eye(3, dtype=strain.dtype, device=strain.device)
-        return 2 * SECOND * shear[:, None, None] * strain + pressure[..., None, None] * one
+        return hooke(strain, self.volume[:, None] * factor)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.models.template.grid import FIRST, SECOND
+from gausim.models.template.finite_strain import hooke
 
 # Least part of an impulse that damping leaves in its first frame.
 LEAST_LEFT = 0.1
@@ -162,7 +162,4 @@ def force_of_strain(
         uneven: stiffness of shear and of volume beyond that of the homogeneous body [1 / frame^2].
         modes: E, strain of the modes near each unit times volume, as ``SolidBody.strains`` gives it.
     """
-    shear, volume = uneven.unbind(-1)
-    trace = strain[..., ::4].sum(-1) * (FIRST * volume)
-    stress = 2 * SECOND * shear[:, None] * strain + trace[..., None] * torch.eye(3).to(strain).flatten()
-    return -stress.flatten(1) @ modes.flatten(0, 1)
+    return -hooke(strain.unflatten(-1, (3, 3)), uneven).flatten(1) @ modes.flatten(0, 1)
