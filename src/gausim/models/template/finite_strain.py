@@ -39,12 +39,17 @@ class FiniteStrain(nn.Module):
 
     gradients: Tensor  # H_m, displacement gradients of the modes near the units, row by row (9 N, M) [1 / scene units]
     volume: Tensor  # w of the cells near each unit (N,)
+    measures: Tensor  # derivatives of the seven measures of sym(F^T H) with respect to F and H (9, 7 x 9)
+    moduli: Tensor  # of shear and of volume in the energy of each measure (2, 7)
 
     def __init__(self, gradients: np.ndarray, volume: np.ndarray, *, scale: float = 1.0) -> None:
         """Takes displacement gradients (N, 9, M) of the modes and volumes (N,), in multiples of 1 / ``scale``."""
         super().__init__()
         for name, array in {"gradients": gradients.reshape(-1, gradients.shape[-1]), "volume": scale * volume}.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
+        moduli = torch.tensor([6 * [2 * SECOND] + [0.0], 6 * [0.0] + [FIRST]])
+        self.register_buffer("measures", _measures(), persistent=False)
+        self.register_buffer("moduli", moduli, persistent=False)
 
     def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
         """S of every unit."""
@@ -82,21 +87,13 @@ class FiniteStrain(nn.Module):
         own = stress.diagonal(dim1=-2, dim2=-1)
         least = (own - (stress.abs().sum(-1) - own.abs())).amin(-1)  # Gershgorin's bound of the eigenvalues
         stress = stress + (-least).clamp_min(0)[..., None, None] * one
-        shear, bulk = (x[:, None, None] for x in (self.volume[:, None] * factor).unbind(-1))
-        mean, last = gradient + one, second.gradient + one
-        grown, lame = (1 + 2 * damping) * SECOND * shear * mean, (1 + 2 * damping) * FIRST * bulk * mean
-        # Blocks (9, 9) of every unit, by rows and columns of what is pulled and of what moves.
-        blocks = torch.einsum("...ac,bd->...abcd", grown @ last.mT, one)
-        blocks = (
-            blocks
-            + torch.einsum("...ad,...cb->...abcd", grown, last)
-            + torch.einsum("...ab,...cd->...abcd", lame, last)
+        weight = ((self.volume[:, None] * factor) @ self.moduli)[..., None]
+        mean, last, rest = (
+            (f.flatten(-2) @ self.measures).unflatten(-1, (7, 9)) for f in (gradient + one, second.gradient + one, one)
         )
-        blocks = blocks + torch.einsum("ac,...bd->...abcd", one, stress)
-        even, swapped = (torch.einsum(f"ab,cd->{order}", one, one) for order in ("acbd", "acdb"))
-        linear = SECOND * shear[..., None, None] * (even + swapped)
-        linear = linear + FIRST * bulk[..., None, None] * torch.einsum("ab,cd->abcd", one, one)
-        blocks = (blocks - linear).flatten(-4, -3).flatten(-2)
+        # Blocks (9, 9) of every unit, by rows and columns of what is pulled and of what moves.
+        blocks = (1 + 2 * damping) * mean.mT @ (weight * last) - rest.mT @ (weight * rest)
+        blocks.unflatten(-1, (3, 3)).unflatten(-3, (3, 3)).diagonal(dim1=-4, dim2=-2).add_(stress[..., None])
         turned = blocks @ self.gradients.unflatten(0, (-1, 9))
         return self.gradients.mT @ turned.flatten(-3, -2)
 
@@ -124,3 +121,17 @@ class FiniteStrain(nn.Module):
     def _stress(self, strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
         """Hooke's stress of a strain, times volume."""
         return hooke(strain, self.volume[:, None] * factor)
+
+
+def _measures() -> Float[Tensor, "9 63"]:
+    """Three strains, three shear strains times the root of 2, and the trace: the energy is a sum of their squares.
+
+    By rows F_ij, by columns measure and H_kl.
+    """
+    found = torch.zeros(3, 3, 7, 3, 3)
+    for number, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))):
+        for k in range(3):
+            for first, second in ((i, j), (j, i)):
+                found[k, first, number, k, second] += 0.5 if i == j else 0.5**0.5
+    found[:, :, 6] = found[:, :, :3].sum(2)
+    return found.flatten(2).flatten(0, 1)
