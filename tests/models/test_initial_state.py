@@ -54,6 +54,15 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
         assert torch.allclose(within, offset @ (deformation_gradients[c] @ velocity).T, atol=1e-5)
 
 
+def test_only_the_lowest_modes_may_have_velocities(model) -> None:
+    every, some = ModalInitialStates(model, [0]), ModalInitialStates(model, [0], modes=3)
+    assert [len(initial.velocity[0]) for initial in (every, some)] == [5, 3]
+    with torch.no_grad():
+        some.velocity[0].copy_(torch.tensor([0.2, -0.1, 0.3]))
+        every.velocity[0][:3] = some.velocity[0]
+    torch.testing.assert_close(some.motion(0), every.motion(0))
+
+
 def test_template_without_a_basis_is_refused() -> None:
     with pytest.raises(ConfigError, match="RestTemplate carries no basis.*FreeInitialStates"):
         ModalInitialStates(make_model(make_scene(40)), [0])

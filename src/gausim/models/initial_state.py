@@ -128,17 +128,26 @@ class FreeInitialStates(InitialStates):
 
 
 class ModalInitialStates(InitialStates):
-    """Modal initial states: o = sum_m v_m phi_m(X), with M amplitudes v_m of template modes per sequence.
+    """Modal initial states: o = sum_m v_m phi_m(X), with M amplitudes v_m of the template's lowest modes per sequence.
 
     The velocity field of an elastic body is smooth; most per-kernel offsets would remain undetermined by 16 frames.
     """
 
-    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int], *, in_diagonals: bool = False) -> None:
+    def __init__(
+        self,
+        model: GausSim,
+        scene_of_sequence: Sequence[int],
+        *,
+        modes: int | None = None,
+        in_diagonals: bool = False,
+    ) -> None:
         """Creates one parameter per sequence, initially zero.
 
         Args:
             model: its template must have a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
             scene_of_sequence: index of the scene of each sequence.
+            modes: number of the lowest modes that have a velocity; None for all. Modal derivatives only follow the
+                vibrations; with velocities of their own they would swing on, far above the frame rate.
             in_diagonals: normalise phi_m to a largest kernel displacement of one diagonal, so that one learning rate
                 means the same motion for every object and template; else v_m is in the template's units.
         """
@@ -151,7 +160,7 @@ class ModalInitialStates(InitialStates):
                     f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
                     "Use gausim.models.initial_state.FreeInitialStates with it."
                 )
-            basis = motions.kernels / motions.sizes
+            basis = (motions.kernels / motions.sizes)[..., :modes]
             most = basis.norm(dim=1).amax(0).clamp_min(TINY)
             self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
         for scene_id, basis in enumerate(self._basis):

@@ -5,7 +5,7 @@ Rollouts z_{t+1} = after(z_t, z_{t-1}) of the template alone are compared with t
     sum_t |z_t - z*_t|^2 / size^2,    size^2 = mean_t |z*_t|^2 of the sequence,
 
 relative to the reference of bodies in hands, whose acceleration is a load,
-with T growing from 2 to its longest in the first half and rates that fall as a half-cosine.
+with T growing from 2 to its longest in the first quarter and rates that fall as a half-cosine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gausim.models.template.modal import ModalScene
 from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
 
 # Predicted frames in the first update, and fraction of the updates over which T grows.
-SHORTEST, GROWING = 2, 0.5
+SHORTEST, GROWING = 2, 0.25
 FALLING = StableDecaySchedule(warmup=0.0, decay=1.0)
 
 
