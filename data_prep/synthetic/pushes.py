@@ -15,7 +15,10 @@ FIRST_SWING = 12
 TRIAL_SPEED = 1.0  # [diagonals / s], of about the size that the amplitudes ask for
 # Amplitude beyond which one trial does not hit it [diagonals].
 LINEAR = 0.1
-TRIALS, TOLERANCE = 6, 0.05
+TOLERANCE = 0.05
+# Trials that correct a speed by the whole ratio of amplitudes, and by its root: some bodies answer so steeply that
+# corrections by the whole ratio turn about the amplitude.
+WHOLE, HALF = 6, 6
 
 
 @dataclass(frozen=True)
@@ -62,14 +65,14 @@ def pushed_motion(body: Body, elastic: ElasticBody, push: Push, frames: int) -> 
     velocity *= TRIAL_SPEED * body.diagonal / np.abs(velocity).max()
     if push.amplitude <= LINEAR:
         return elastic.simulate(velocity * (push.amplitude / _peak(body, elastic, velocity)), frames)
-    for _ in range(TRIALS):
+    for exponent in WHOLE * [1.0] + HALF * [0.5]:
         peak = _peak(body, elastic, velocity)
         if abs(peak / push.amplitude - 1) < TOLERANCE:
             return elastic.simulate(velocity, frames)
-        velocity *= push.amplitude / peak
+        velocity *= (push.amplitude / peak) ** exponent
     raise DivergenceError(
-        f"a {push.kind} of {push.amplitude:.3f} diagonals is not reached within {TRIALS} trials; the last gave "
-        f"{peak:.3f}. Choose a smaller --swing."
+        f"a {push.kind} of {push.amplitude:.3f} diagonals is not reached within {WHOLE + HALF} trials; the last "
+        f"gave {peak:.3f}. Choose a smaller --swing."
     )
 
 

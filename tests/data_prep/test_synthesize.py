@@ -160,6 +160,20 @@ def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
     assert 0.4 < swing[-16:].max() / swing[:16].max() < 0.7
 
 
+@pytest.mark.parametrize("steep", [0.5, 1.0, 2.1, 2.5])
+def test_large_swings_are_reached_however_steeply_a_body_answers(steep: float) -> None:
+    body = BODIES[PUSHED[0]]()
+
+    class Answer:
+        def simulate(self, velocity: np.ndarray, frames: int) -> np.ndarray:
+            size = np.linalg.norm(velocity, axis=1).max() / body.diagonal
+            return np.stack([body.nodes, body.nodes + velocity * 0.4 * size ** (steep - 1)])
+
+    push = random_push(body, "poke", np.random.default_rng(3), (0.27, 0.28))
+    moved = pushed_motion(body, Answer(), push, 50) - body.nodes
+    assert np.linalg.norm(moved, axis=-1).max() / body.diagonal == pytest.approx(push.amplitude, rel=0.05)
+
+
 @pytest.mark.parametrize("name", PUSHED)
 def test_pokes_are_local_and_held_nodes_stay(name: str) -> None:
     body = BODIES[name]()
