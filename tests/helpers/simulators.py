@@ -26,6 +26,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "rest_inputs",
         "coarse_inputs",
         "velocities",
+        "centred",
         "attributes",
         "gravity",
         "normaliser_floor",

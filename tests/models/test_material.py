@@ -183,6 +183,29 @@ def test_rest_is_an_equilibrium_whatever_the_weights() -> None:
     assert float((step.positions - batch.rest).abs().max()) > 1e-4
 
 
+def _inputs(model) -> list:
+    """Units and template positions that the network is asked about in a step."""
+    asked = []
+    with mock.patch.object(model.predictor, "forward", side_effect=model.predictor.forward) as ask:
+        model.step(model.batch((0,)), make_state(model.scenes[0]))
+    for call in ask.call_args_list:
+        _, unit, _, target, _ = call.args
+        asked.append((unit, target))
+    return asked
+
+
+@torch.no_grad()
+def test_network_sees_the_middle_of_the_step() -> None:
+    """Centred inputs are (x_{t+1} + 2 x_t + x_{t-1}) / 4 of the template's motion, at every level."""
+    plain, centred = (_inputs(neural_model(centred=centred)) for centred in (False, True))
+    assert len(centred) >= 2 * len(neural_model().predicted_levels)
+    for (unit, target), (other, same) in zip(plain, centred, strict=True):
+        torch.testing.assert_close(same, target)
+        torch.testing.assert_close(other.before, unit.before)
+        torch.testing.assert_close(other.now, (target + 2 * unit.now + unit.before) / 4)
+    assert any(not torch.equal(unit.now, other.now) for (unit, _), (other, _) in zip(plain, centred, strict=True))
+
+
 def _moved(scene, turn, shift):
     return replace(scene, means=scene.means @ turn.mT + shift)
 

@@ -39,6 +39,8 @@ class FeatureOptions:
         coarse_inputs: below the top level use positions of the coarse prediction instead of the current state.
         velocities: use velocities and accelerations; without them, levers X_i - X_p, displacements and the parent's
             displacement of the template position.
+        centred: positions in the middle of the step, where the template takes its forces: with its prediction they are
+            (x_{t+1} + 2 x_t + x_{t-1}) / 4. What turns round in every frame is not seen there, and not driven on.
         attributes: material attributes per unit.
         gravity: acceleration [scene units / s^2].
         normaliser_floor: smallest standard deviation of a normalised input.
@@ -52,6 +54,7 @@ class FeatureOptions:
     rest_inputs: bool = False
     coarse_inputs: bool = False
     velocities: bool = True
+    centred: bool = False
     attributes: int = 4
     gravity: Sequence[float] = (0.0, 0.0, 0.0)
     normaliser_floor: float = 1e-2
@@ -70,6 +73,12 @@ class FeatureOptions:
     def of(self, scenes: Sequence[GaussianScene]) -> FeatureOptions:
         """The features of a model of these scenes: without the floor where none of them has one."""
         return replace(self, floor=self.floor and any(scene.surroundings.floor for scene in scenes))
+
+    def positions(
+        self, before: Float[Tensor, "N 3"], now: Float[Tensor, "N 3"], after: Float[Tensor, "N 3"]
+    ) -> Float[Tensor, "N 3"]:
+        """Positions among the inputs, from those at t - 1, t and t + 1 (the template's prediction)."""
+        return now + (after - 2 * now + before) / 4 if self.centred else now
 
     @property
     def node_normalised(self) -> int:

@@ -159,7 +159,8 @@ class GausSim(SceneModel):
         rest = prepared.levels[-1].rest
         seen = prepared.template.carried(Motion(rest, units.now, units.before))
         template = prepared.template(seen, units.load)
-        states = [prepared.per_level(x) for x in (seen.now, seen.before, template.positions)]
+        now = self.predictor.features.positions(seen.before, seen.now, template.positions)
+        states = [prepared.per_level(x) for x in (now, seen.before, template.positions)]
         above, momentum, predicted = prepared.roots, rest.new_zeros(()), []
         unit_of_correction = prepared.template.correction_unit()
         for position, (level, fixed, x, previous, target, floor) in enumerate(
