@@ -88,6 +88,13 @@ def test_other_models_hand_on_their_network_too(model: str, toy: Path, other: Pa
     assert shared and all(torch.equal(frozen[name], source[name]) for name in shared)
 
 
+def test_other_settings_than_those_of_the_network_are_named(joint: Path, other: Path, tmp_path: Path, capsys) -> None:
+    tune(other, joint, tmp_path / "alike")
+    assert "other values of" not in capsys.readouterr().out
+    tune(other, joint, tmp_path / "centred", "model.simulator.features.centred=true")
+    assert "was trained with other values of model.simulator.features.centred\n" in capsys.readouterr().out
+
+
 def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path, tmp_path: Path) -> None:
     message = (
         r"init_from: the network of .*last\.ckpt does not fit this model: predictor\.network\.decoder\.0\.bias is "

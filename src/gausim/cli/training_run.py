@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,7 +37,7 @@ from gausim.training.material_scan import find_materials
 from gausim.training.module import GausSimModule
 from gausim.training.ranks.launch import Crew
 from gausim.training.trainer import make_trainer
-from gausim.training.transfer import load_shared, load_simulator
+from gausim.training.transfer import load_shared, load_simulator, unlike
 
 # Largest first displacement per frame observed for small pushes [diagonals].
 FIRST_STEP = 0.065
@@ -308,8 +309,16 @@ def _introduce(
             f"at most {epochs} epochs of {batches} steps, {shows} shows of each sequence; "
             f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames",
             *_slow_beginnings(module, shows),
+            *_other_settings(run.config()),
         ]
     print("".join(f"  {line}\n" for line in lines), end="", flush=True)
+
+
+def _other_settings(config: Mapping[str, Any]) -> list[str]:
+    """A warning if the run that weights are taken from has another model, in which they mean something else."""
+    source = config.get("init_from")
+    others = unlike(source, config["model"]) if source else []
+    return [f"warning: {source} was trained with other values of {', '.join(others)}"] if others else []
 
 
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:

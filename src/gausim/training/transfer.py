@@ -64,6 +64,13 @@ def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, 
     simulator.load_state_dict(found)
 
 
+def unlike(run_dir: Path | str, model: Mapping[str, Any]) -> list[str]:
+    """Dotted settings of a simulator that a run has otherwise; weights of equal shape mean something else with them."""
+    there = RunDirectory(run_dir).config().get("model", {})
+    keys = differing_keys({"simulator": there.get("simulator", {})}, {"simulator": model.get("simulator", {})})
+    return [f"model.{key}" for key in keys]
+
+
 def _read(run_dir: Path | str) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
     """A trained simulator's weights by name (moving averages where the run has them), and its scenes."""
     checkpoint = read_checkpoint(RunDirectory(run_dir).checkpoint)
@@ -88,8 +95,7 @@ def _check(
             there, here = ("absent" if shape is None else f"of shape {shape}" for shape in shapes)
             problems.append(f"{name} is {there} there, {here} here")
     if problems:
-        run = RunDirectory(run_dir)
-        changed = [f"model.{key}" for key in differing_keys(run.config().get("model", {}), model)]
+        run, changed = RunDirectory(run_dir), unlike(run_dir, model)
         more = f" and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
         raise ConfigError(
             f"init_from: the {what} of {run.checkpoint} does not fit this model: {'; '.join(problems[:_SHOWN])}{more}. "
