@@ -104,7 +104,8 @@ def test_a_fit_that_runs_astray_is_made_again_at_half_the_rates(
 ) -> None:
     seen: list[tuple[float, float, list[torch.Tensor]]] = []
 
-    def fit(model, motions, settings, groups, *, longest, updates):
+    def fit(model, motions, settings, groups, *, longest, updates, growing):
+        assert growing == 0.25  # of model=gausim
         weights = [p for own in groups.values() for p in own]
         seen.append((settings.scene_lr, settings.initial_lr, [p.detach().clone() for p in weights]))
         for p in weights:
@@ -127,3 +128,5 @@ def test_wrong_settings_are_refused() -> None:
         WarmStart(updates=-1)
     with pytest.raises(ConfigError, match="decay=-0.1"):
         WarmStart(decay=-0.1)
+    with pytest.raises(ConfigError, match=r"growing in \(0, 1\].*growing=0.0"):
+        WarmStart(growing=0.0)

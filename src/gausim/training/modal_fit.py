@@ -5,7 +5,7 @@ Rollouts z_{t+1} = after(z_t, z_{t-1}) of the template alone are compared with t
     sum_t |z_t - z*_t|^2 / size^2,    size^2 = mean_t |z*_t|^2 of the sequence,
 
 relative to the reference of bodies in hands, whose acceleration is a load,
-with T growing from 2 to its longest in the first quarter and rates that fall as a half-cosine.
+with T growing from 2 to its longest in a first part and rates that fall as a half-cosine.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.modal import ModalScene
 from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
 
-# Predicted frames in the first update, and fraction of the updates over which T grows.
-SHORTEST, GROWING = 2, 0.25
+# Predicted frames in the first update.
+SHORTEST = 2
 FALLING = StableDecaySchedule(warmup=0.0, decay=1.0)
 
 
@@ -62,6 +62,7 @@ def fit(
     *,
     longest: int,
     updates: int,
+    growing: float = 0.5,
 ) -> Iterator[float]:
     """Fits parameters of a model to known motion; yields the loss of every update.
 
@@ -75,13 +76,14 @@ def fit(
         groups: the parameters, without the network's.
         longest: largest T.
         updates: number of updates.
+        growing: fraction of the updates over which T grows to its largest.
     """
     settings = replace(settings, schedule=FALLING)
     trained = {name: [p for p in own if p.requires_grad] for name, own in groups.items()}
     weights = [p for own in trained.values() for p in own]
     optimizer, least, kept = settings.build(trained), math.inf, [p.detach().clone() for p in weights]
     for update in range(updates):
-        steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / GROWING))
+        steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / growing))
         settings.set_rates(optimizer, update, updates)
         optimizer.zero_grad(set_to_none=True)
         total = 0.0

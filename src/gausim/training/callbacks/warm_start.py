@@ -56,6 +56,7 @@ class WarmStart(Callback):
         template_lr: float = 1e-2,
         initial_lr: float = 2e-3,
         decay: float = 0.0,
+        growing: float = 0.5,
         later: float = 0.2,
         epochs: int = 30,
     ) -> None:
@@ -69,15 +70,19 @@ class WarmStart(Callback):
             template_lr: that of the template.
             initial_lr: that of the initial states.
             decay: weight decay of the attributes in the fit; without it, long fits follow the errors of the tracks.
+            growing: fraction of the updates over which T grows to its largest. What a fit keeps is its best at that T:
+                the earlier it is reached, the less harm is done by one that runs astray.
             later: factor on these three rates in the training that follows, which starts near the solution.
             epochs: most epochs of that training; its rates fall from the first on.
         """
-        if updates < 0 or min(sequences, epochs) < 1 or min(decay, later) < 0:
+        if updates < 0 or min(sequences, epochs) < 1 or min(decay, later) < 0 or not 0 < growing <= 1:
             raise ConfigError(
-                "callbacks.warm_start: expected updates, decay and later >= 0, sequences and epochs >= 1, got "
-                f"updates={updates}, decay={decay}, later={later}, sequences={sequences}, epochs={epochs}."
+                "callbacks.warm_start: expected updates, decay and later >= 0, growing in (0, 1], sequences and epochs "
+                f">= 1, got updates={updates}, decay={decay}, later={later}, growing={growing}, sequences={sequences}, "
+                f"epochs={epochs}."
             )
         self._updates, self._sequences, self._later, self._epochs = updates, sequences, later, epochs
+        self._growing = growing
         self._warm = False
         self._settings = OptimizerSettings(
             optimizer=torch.optim.AdamW,
@@ -142,7 +147,9 @@ class WarmStart(Callback):
         begun = [p.detach().clone() for p in weights]
         for settings in (self._settings, self._settings.slower(SLOWER)):
             with torch.enable_grad():
-                losses = modal_fit.fit(model, motions, settings, groups, longest=last, updates=updates)
+                losses = modal_fit.fit(
+                    model, motions, settings, groups, longest=last, updates=updates, growing=self._growing
+                )
                 for loss in with_bar(losses, "Fitting the material", total=updates, quiet=quiet):
                     final = loss
             if final <= ASTRAY or settings is not self._settings:
