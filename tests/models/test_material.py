@@ -13,7 +13,7 @@ from helpers.bodies import NEURAL, make_model, make_scene, make_state, neural_mo
 from helpers.simulators import silence
 
 from gausim.core import Adjustable, SimState
-from gausim.evaluation.stability import _LinearStep
+from gausim.evaluation.stability import _LinearStep, largest_eigenvalue
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.rollout.dynamics import scene_dynamics
@@ -204,6 +204,15 @@ def test_network_sees_the_middle_of_the_step() -> None:
         torch.testing.assert_close(other.before, unit.before)
         torch.testing.assert_close(other.now, (target + 2 * unit.now + unit.before) / 4)
     assert any(not torch.equal(unit.now, other.now) for (unit, _), (other, _) in zip(plain, centred, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_small_motions_grow_less_where_the_network_sees_the_middle_of_the_step(seed: int) -> None:
+    strong = {"output_scale": 10.0, "seed": seed}
+    at_the_start, in_the_middle = (
+        largest_eigenvalue(neural_model(centred=centred, **strong), 0) for centred in (False, True)
+    )
+    assert in_the_middle < min(at_the_start, 1.0)
 
 
 def _moved(scene, turn, shift):
