@@ -40,6 +40,14 @@ class Body:
         tets[negative] = tets[negative][:, [0, 2, 1, 3]]
         return tets
 
+    def least_volume(self, positions: Array) -> float:
+        """Smallest volume of an element over that at rest, at node positions (..., N, 3); below 0 it is inside out."""
+        rest, moved = (
+            np.linalg.det(x[..., 1:, :] - x[..., :1, :])
+            for x in (self.nodes[self.tetrahedra], positions[..., self.tetrahedra, :])
+        )
+        return float((moved / rest).min())
+
     @property
     def diagonal(self) -> float:
         """Length of the bounding-box diagonal [scene units]."""

@@ -19,6 +19,8 @@ TOLERANCE = 0.05
 # Trials that correct a speed by the whole ratio of amplitudes, and by its root: some bodies answer so steeply that
 # corrections by the whole ratio turn about the amplitude.
 WHOLE, HALF = 6, 6
+# Pushes that are drawn at most until one turns no finite element inside out.
+DRAWS = 50
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,27 @@ class Push:
     point: tuple[float, float, float]  # where [scene units]
     direction: tuple[float, float, float]  # where to, unit length
     amplitude: float  # largest displacement that it causes, as a fraction of the body's diagonal
+
+
+def random_motion(
+    body: Body, elastic: ElasticBody, kind: str, rng: np.random.Generator, swing: tuple[float, float], frames: int
+) -> tuple[Push, Array]:
+    """A random push and the motion (frames, N, 3) after it.
+
+    Pushes that turn an element inside out, which no solid does, are drawn again.
+
+    Raises:
+        DivergenceError: all pushes that were drawn do, or one does not reach its amplitude.
+    """
+    for _ in range(DRAWS):
+        push = random_push(body, kind, rng, swing)
+        motion = pushed_motion(body, elastic, push, frames)
+        if body.least_volume(motion) > 0:
+            return push, motion
+    raise DivergenceError(
+        f"{DRAWS} pushes of {swing[0]:g} to {swing[1]:g} diagonals all turned finite elements inside out. Choose a "
+        "smaller --swing."
+    )
 
 
 def random_push(body: Body, kind: str, rng: np.random.Generator, swing: tuple[float, float]) -> Push:

@@ -16,7 +16,7 @@ from data_prep.synthetic.falls import fall_field, random_fall
 from data_prep.synthetic.hands import grip, held_path, random_path
 from data_prep.synthetic.paint import PAINTERS
 from data_prep.synthetic.plan import RECIPES, TRAIN_FRAMES, Plan
-from data_prep.synthetic.pushes import pushed_motion, random_push
+from data_prep.synthetic.pushes import random_motion
 from data_prep.synthetic.rig import photograph, still_cameras, video_cameras
 from gausim.core import Cameras, GaussianScene
 from gausim.data.images import write_rgba
@@ -113,8 +113,9 @@ class SyntheticObject:
             times = np.arange(steps + 1) / (self.plan.fps * self.elastic.substeps)
             held = held_path(body, path, times)
             return self.elastic.simulate(np.zeros_like(body.nodes), frames, path=held), asdict(path)
-        push = random_push(body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
-        return pushed_motion(body, self.elastic, push, frames), asdict(push)
+        kind, rng = ("poke", "drag")[number % 2], self._rng("push", number)
+        push, motion = random_motion(body, self.elastic, kind, rng, self._swing, frames)
+        return motion, asdict(push)
 
     def _photograph(self, displacement: Array, cameras: Cameras) -> np.ndarray:
         """(F, V, H, W, 4) images of the scene under node displacements (F, N, 3)."""
