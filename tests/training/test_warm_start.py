@@ -99,30 +99,6 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
     assert float(distances.mean()) == pytest.approx(later[-1], rel=1e-4)
 
 
-def test_a_fit_that_runs_astray_is_made_again_at_half_the_rates(
-    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    seen: list[tuple[float, float, list[torch.Tensor]]] = []
-
-    def fit(model, motions, settings, groups, *, longest, updates, growing):
-        assert growing == 0.25  # of model=gausim
-        weights = [p for own in groups.values() for p in own]
-        seen.append((settings.scene_lr, settings.initial_lr, [p.detach().clone() for p in weights]))
-        for p in weights:
-            p.data.add_(1.0)
-        yield 1.03 if len(seen) == 1 else 0.2
-
-    monkeypatch.setattr(modal_fit, "fit", fit)
-    common = [f"data.root={toy}", "model=gausim", *QUICK, "trainer.max_epochs=1", "callbacks.warm_start.updates=60"]
-    assert train.main([*common, f"hydra.run.dir={tmp_path / 'run'}"]) == 0
-    printed = capsys.readouterr().out
-    assert "the fit ran astray (1.030 of the motion left)" in printed
-    assert "without a network 0.200 of the motion is left" in printed
-    (first, slow, begun), (second, slower, again) = seen
-    assert (second, slower) == (first / 2, slow / 2)
-    assert all(torch.equal(a, b) for a, b in zip(begun, again, strict=True))
-
-
 def test_wrong_settings_are_refused() -> None:
     with pytest.raises(ConfigError, match="warm_start: expected updates, decay and later >= 0"):
         WarmStart(updates=-1)

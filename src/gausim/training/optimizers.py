@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -119,11 +119,6 @@ class OptimizerSettings:
         wrong = [name for name, value in self.decay.items() if name not in GROUPS or not value >= 0]
         if wrong:
             raise ConfigError(f"optimizer.decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}.")
-
-    def slower(self, factor: float) -> OptimizerSettings:
-        """The same with rates times ``factor``."""
-        rates = {name: getattr(self, name) for name in (f"{group}_lr" for group in GROUPS)}
-        return replace(self, **{name: factor * rate for name, rate in rates.items() if rate is not None})
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
         """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.

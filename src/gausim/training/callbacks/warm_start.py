@@ -34,8 +34,6 @@ from gausim.training.supervision.points import PointSupervision
 
 # Predicted frames of the rollouts that the number of updates is meant for.
 USUAL = 15
-# A fit that leaves more of the motion has run astray, and is made again with rates this many times as large.
-ASTRAY, SLOWER = 0.5, 0.5
 # Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
 Tracked = list[tuple[SequenceSample, Tensor]]
 
@@ -143,20 +141,12 @@ class WarmStart(Callback):
             found.setdefault(sample.scene_id, []).append((sample, moved))
         motions = [(i, _Known(module, states, i, tracked, self._sequences)) for i, tracked in found.items()]
         updates = math.ceil(self._updates * min(1.0, USUAL / last))
-        weights = [p for own in groups.values() for p in own]
-        begun = [p.detach().clone() for p in weights]
-        for settings in (self._settings, self._settings.slower(SLOWER)):
-            with torch.enable_grad():
-                losses = modal_fit.fit(
-                    model, motions, settings, groups, longest=last, updates=updates, growing=self._growing
-                )
-                for loss in with_bar(losses, "Fitting the material", total=updates, quiet=quiet):
-                    final = loss
-            if final <= ASTRAY or settings is not self._settings:
-                break
-            print(f"  warm start: the fit ran astray ({final:.3f} of the motion left): again, slower", flush=True)
-            for weight, value in zip(weights, begun, strict=True):
-                weight.copy_(value)
+        with torch.enable_grad():
+            losses = modal_fit.fit(
+                model, motions, self._settings, groups, longest=last, updates=updates, growing=self._growing
+            )
+            for loss in with_bar(losses, "Fitting the material", total=updates, quiet=quiet):
+                final = loss
         sequences = f"{count} sequence{'s' if count != 1 else ''}"
         print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
 
