@@ -9,7 +9,7 @@ from helpers.bodies import pull_of
 
 from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.grid import FIRST, SECOND
-from gausim.models.template.solid import solid_body
+from gausim.models.template.solid import SolidBody, solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
 
 
@@ -96,23 +96,34 @@ def test_a_rotation_strains_nothing(cells: FiniteStrain) -> None:
     assert float(cells.stretched(torch.zeros(1, 5, dtype=torch.float64), turned).strain.abs().max()) < 1e-7
 
 
-def _clamped(curved: int) -> tuple[FiniteStrain, torch.Tensor, torch.Tensor]:
-    """A slender bar held at one end: its cells, eigenvalues and the first mode's tip at coordinate 1."""
+def _clamped(curved: int) -> tuple[SolidBody, np.ndarray]:
+    """A slender bar held at one end, and its kernels (K, 3)."""
     axes = [np.linspace(0, s, round(s / 0.125) + 1) for s in (4.0, 0.5, 0.5)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     kernels = points[((points == 0) | (points == np.array([4.0, 0.5, 0.5]))).any(1)]
     pinned = kernels[:, 0] == 0
     body = solid_body(kernels, pinned, kernels, np.ones(len(kernels)), pinned, modes=16, spacing=0.25, curved=curved)
-    gradients, volume = body.mean_gradients(kernels)
-    tip = body.at(np.array([[4.0, 0.25, 0.25]]))[0][0]
-    return FiniteStrain(gradients, volume).double(), torch.from_numpy(body.values), torch.from_numpy(tip)
+    return body, kernels
+
+
+def test_vibrations_come_before_modal_derivatives() -> None:
+    (plain, kernels), (curved, _) = _clamped(0), _clamped(4)
+    count = curved.vibrations
+    assert plain.vibrations == 16 and count == 8 and len(curved.values) == 16
+    np.testing.assert_allclose(curved.values[:count], plain.values[:count], rtol=1e-6)
+    assert curved.values[count:].min() > plain.values[count]
+    first, second = (body.at(kernels)[0][..., :count].reshape(-1, count) for body in (plain, curved))
+    # The square bar bends alike in two directions, so spans are compared and not single modes.
+    np.testing.assert_allclose(first @ np.linalg.lstsq(first, second, rcond=None)[0], second, atol=1e-6)
 
 
 def test_modal_derivatives_let_a_bar_bend_far_at_the_cost_of_bending() -> None:
     """Linear modes lengthen a bar that bends, and then it is stiff; with derivatives the tip comes nearer instead."""
     worst, grown = {}, {}
     for curved in (0, 4):
-        cells, values, tip = _clamped(curved)
+        body, kernels = _clamped(curved)
+        cells = FiniteStrain(*body.mean_gradients(kernels)).double()
+        values, tip = torch.from_numpy(body.values), torch.from_numpy(body.at(np.array([[4.0, 0.25, 0.25]]))[0][0])
         factor = torch.ones(len(cells.volume), 2, dtype=torch.float64)
         bent = torch.zeros_like(values)
         bent[0] = 1.0 / float(tip[:, 0].norm())  # a quarter of the length

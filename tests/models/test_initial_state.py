@@ -54,8 +54,11 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
         assert torch.allclose(within, offset @ (deformation_gradients[c] @ velocity).T, atol=1e-5)
 
 
-def test_only_the_lowest_modes_may_have_velocities(model) -> None:
-    every, some = ModalInitialStates(model, [0]), ModalInitialStates(model, [0], modes=3)
+def test_only_vibrations_may_have_velocities(model, monkeypatch: pytest.MonkeyPatch) -> None:
+    every = ModalInitialStates(model, [0], vibrations=True)
+    monkeypatch.setattr(model.template, "vibrations", lambda scene_id: 3)
+    some = ModalInitialStates(model, [0], vibrations=True)
+    assert len(ModalInitialStates(model, [0]).velocity[0]) == 5
     assert [len(initial.velocity[0]) for initial in (every, some)] == [5, 3]
     with torch.no_grad():
         some.velocity[0].copy_(torch.tensor([0.2, -0.1, 0.3]))

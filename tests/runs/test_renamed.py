@@ -76,6 +76,14 @@ def test_weights_of_before_are_read_by_present_names() -> None:
     }  # fmt: skip
 
 
+def test_the_number_of_modes_with_a_velocity_is_a_switch_now() -> None:
+    old = {"_target_": "gausim.models.initial_state.ModalInitialStates", "in_diagonals": True}
+    for modes, vibrations in ((27, True), (None, False)):
+        new = with_present_names({**old, "modes": modes})
+        assert new == {**old, "vibrations": vibrations} and with_present_names(new) == new
+    assert with_present_names(old) == old
+
+
 def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused() -> None:
     old = {"_target_": "gausim.models.elastic.ElasticTemplate", "modes": 8, "solid": 0.12}
     old |= {"hidden": 0, "damping": "full"}

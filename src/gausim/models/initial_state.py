@@ -138,7 +138,7 @@ class ModalInitialStates(InitialStates):
         model: GausSim,
         scene_of_sequence: Sequence[int],
         *,
-        modes: int | None = None,
+        vibrations: bool = False,
         in_diagonals: bool = False,
     ) -> None:
         """Creates one parameter per sequence, initially zero.
@@ -146,8 +146,8 @@ class ModalInitialStates(InitialStates):
         Args:
             model: its template must have a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
             scene_of_sequence: index of the scene of each sequence.
-            modes: number of the lowest modes that have a velocity; None for all. Modal derivatives only follow the
-                vibrations; with velocities of their own they would swing on, far above the frame rate.
+            vibrations: only these have a velocity. Modal derivatives only follow them; with velocities of their own
+                they would swing on, far above the frame rate. False for runs that have velocities of all modes.
             in_diagonals: normalise phi_m to a largest kernel displacement of one diagonal, so that one learning rate
                 means the same motion for every object and template; else v_m is in the template's units.
         """
@@ -160,7 +160,7 @@ class ModalInitialStates(InitialStates):
                     f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
                     "Use gausim.models.initial_state.FreeInitialStates with it."
                 )
-            basis = (motions.kernels / motions.sizes)[..., :modes]
+            basis = (motions.kernels / motions.sizes)[..., : motions.vibrations if vibrations else None]
             most = basis.norm(dim=1).amax(0).clamp_min(TINY)
             self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
         for scene_id, basis in enumerate(self._basis):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 MOVED = {
@@ -41,6 +41,8 @@ GONE = {
     "TrainerSettings": ("overwrite",),
     "TrackSupervision": ("rate",),
 }
+# New settings of old ones by class: old name, new name, and what makes the new value.
+CHANGED: dict[str, tuple[str, str, Callable[[Any], Any]]] = {"ModalInitialStates": ("modes", "vibrations", bool)}
 # No schedule now means a constant rate; a run with the cosine schedule can be evaluated, but not resumed.
 SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 # Removed settings of which one value is still supported; a false value stands for all false values.
@@ -131,6 +133,10 @@ def with_present_names(config: Any) -> Any:
         wanted = [k for k, left in unsupported.items() if (config.get(k, left) or None) != left]
         if wanted:
             raise ValueError(f"{wanted[0]} is {config[wanted[0]]!r}, which is no longer supported: train the run again")
+        if name in CHANGED and CHANGED[name][0] in config:
+            old, new, made = CHANGED[name]
+            config = {**config, new: made(config[old])}
+            del config[old]
         gone = (*GONE.get(name, ()), *unsupported)
         found = {
             k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items() if k not in gone

@@ -145,6 +145,7 @@ class BodyModes(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
         self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
         self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
+        self.vibrations = body.vibrations
         self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
 
 
@@ -333,6 +334,10 @@ class MaterialTemplate(Template):
         body = self.body(scene_id)
         sizes = body.values**-0.25
         return body.modes * (body.scale * sizes), body.gradients * (body.scale * sizes), sizes
+
+    def vibrations(self, scene_id: int) -> int:
+        """All modes but the modal derivatives of finite strain."""
+        return self.body(scene_id).vibrations
 
 
 def _saturated(logarithms: Tensor) -> Tensor:

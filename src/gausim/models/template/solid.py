@@ -52,6 +52,7 @@ class SolidBody:
     field: np.ndarray  # coefficients (3, nodes, M) of the modes, orthonormal under the units' mass
     centres: np.ndarray  # of the integration cells (Q, 3) [scene units]
     weights: np.ndarray  # their volumes (Q,), outside the body times :data:`OUTSIDE` [scene units^3]
+    vibrations: int  # modes that are vibrations; the others, above them, are modal derivatives
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Modes (P, 3, M) and displacement gradients (P, 3, 3, M) [1 / scene units] at points (P, 3)."""
@@ -154,11 +155,12 @@ def solid_body(
     rigid = None if held.any() else grid.rigid_coefficients()[used]
     whole, carry = whole[used][:, used], sp.diags(root) @ carry
     eigenvalues, vectors = lowest(whole, carry, modes, rigid)
+    vibrations = len(eigenvalues)
     if curved:
-        found = SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights)
+        found = SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
         bent = derivatives(found, curved, whole, used, carry, rigid)
-        eigenvalues, vectors = _joined(vectors, bent, whole, carry)
-    return SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights)
+        eigenvalues, vectors, vibrations = _joined(vectors, bent, whole, carry)
+    return SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
 
 
 def _full(vectors: np.ndarray, used: np.ndarray, grid: Grid) -> np.ndarray:
@@ -204,8 +206,12 @@ def _stress(gradient: np.ndarray) -> np.ndarray:
 
 def _joined(
     vectors: np.ndarray, bent: np.ndarray, whole: sp.spmatrix, carry: sp.spmatrix
-) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors, as many as ``vectors``, of the lowest of them and the largest parts of ``bent``."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Eigenvalues and vectors, as many as ``vectors``, of the lowest of them and the largest parts of ``bent``.
+
+    The last value counts those of ``vectors`` among them. They come first: what is orthogonal to the lowest vibrations
+    has larger eigenvalues.
+    """
     more = min(bent.shape[1], vectors.shape[1] // 2)
     kept = vectors[:, : vectors.shape[1] - more]
     bent = bent - kept @ ((carry @ kept).T @ (carry @ bent))
@@ -214,7 +220,7 @@ def _joined(
     basis = np.concatenate((kept, bent @ parts[:more].T / sizes[:more]), 1)
     moved = carry @ basis
     values, turned = eigh(basis.T @ (whole @ basis), moved.T @ moved)
-    return values, basis @ turned
+    return values, basis @ turned, kept.shape[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,6 +148,10 @@ class Template(nn.Module, ABC):
         """
         return None
 
+    def vibrations(self, scene_id: int) -> int | None:
+        """The number of the first modes of :meth:`basis` that vibrate by themselves; None for all."""
+        return None
+
 
 class PreparedScenes(PreparedTemplate):
     """The template of a batch, scene by scene."""
