@@ -64,6 +64,7 @@ def _interrupt(module: object) -> None:
 
 
 def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: Path) -> None:
+    torch.manual_seed(0)
     module, _ = build(compose("train", [f"data.root={toy}", "model=gausim", *QUICK]))
     model, draws = module.model, torch.Generator().manual_seed(3)
     start = 0.1 * torch.randn(2, 6, generator=draws)
