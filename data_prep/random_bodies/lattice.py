@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from data_prep.random_bodies.shapes import Field, Rng
-from data_prep.synthetic.bodies import CORNERS, Array, Body, Ints
+from data_prep.synthetic.bodies import CORNERS, Array, Body, Ints, tet_volumes
 
 EXTENT, FINEST = 1.04, 30  # half of the grid's edge; most cells along it
 SNAP, STEPS = 0.42, 3  # farthest that a node moves to the surface [cells]; Newton steps
@@ -55,13 +55,6 @@ def _snapped(grid: Ints, edge: float, field: Field) -> Body:
         if not bad.any():
             return replace(body, nodes=moved)
         moved[body.cells[bad]] = body.nodes[body.cells[bad]]
-
-
-def tet_volumes(nodes: Array, tetrahedra: Ints) -> Array:
-    """Signed volumes of tetrahedra."""
-    x = nodes[tetrahedra]
-    volumes: Array = np.linalg.det(x[:, 1:] - x[:, :1]) / 6
-    return volumes
 
 
 def warped(body: Body, diagonal: float, rng: Rng) -> Body:

@@ -8,10 +8,9 @@ import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import eigsh
 
-from data_prep.random_bodies.lattice import tet_volumes
 from data_prep.random_bodies.plan import CONTRASTS, DAMPING_RATIOS, DENSITIES, POISSON_RATIOS
 from data_prep.random_bodies.shapes import Rng
-from data_prep.synthetic.bodies import Array, Body
+from data_prep.synthetic.bodies import Array, Body, tet_volumes
 from gausim.core import DivergenceError
 
 

@@ -21,6 +21,13 @@ CORNERS = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
 _PATHS = ((4, 2, 1), (4, 1, 2), (2, 4, 1), (2, 1, 4), (1, 4, 2), (1, 2, 4))
 
 
+def tet_volumes(nodes: Array, tetrahedra: Ints) -> Array:
+    """Signed volumes (..., T) of tetrahedra (T, 4) of nodes (..., N, 3)."""
+    x = nodes[..., tetrahedra, :]
+    volumes: Array = np.linalg.det(x[..., 1:, :] - x[..., :1, :]) / 6
+    return volumes
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """A rest shape."""
@@ -35,18 +42,14 @@ class Body:
         """(6 C, 4) node numbers, positively oriented."""
         corners = [[0, p[0], p[0] + p[1], 7] for p in _PATHS]
         tets = np.concatenate([self.cells[:, c] for c in corners])
-        x = self.nodes[tets]
-        negative = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
+        negative = tet_volumes(self.nodes, tets) < 0
         tets[negative] = tets[negative][:, [0, 2, 1, 3]]
         return tets
 
     def least_volume(self, positions: Array) -> float:
         """Smallest volume of an element over that at rest, at node positions (..., N, 3); below 0 it is inside out."""
-        rest, moved = (
-            np.linalg.det(x[..., 1:, :] - x[..., :1, :])
-            for x in (self.nodes[self.tetrahedra], positions[..., self.tetrahedra, :])
-        )
-        return float((moved / rest).min())
+        tets = self.tetrahedra
+        return float((tet_volumes(positions, tets) / tet_volumes(self.nodes, tets)).min())
 
     @property
     def diagonal(self) -> float:

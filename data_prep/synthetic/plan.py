@@ -11,7 +11,7 @@ TRAIN_FRAMES = 16  # frames 0..15 are seen, as the paper trains
 MOST_TRAIN_VIEWS = 4
 # Amplitudes of a push that stays nearly linear, and of one that bends a body far beyond [diagonals].
 SMALL_SWING, LARGE_SWING = (0.05, 0.08), (0.18, 0.28)
-LARGEST_SWING = 0.5  # [diagonals]; further every body here turns inside out
+LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
 
 
 @dataclass(frozen=True)

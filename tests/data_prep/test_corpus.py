@@ -14,11 +14,11 @@ if importlib.util.find_spec("mujoco") is None or importlib.util.find_spec("warp"
 
 from data_prep.corpus import main
 from data_prep.random_bodies import maker, shapes
-from data_prep.random_bodies.lattice import PINS, body_of, pinned, tet_volumes, warped
+from data_prep.random_bodies.lattice import PINS, body_of, pinned, warped
 from data_prep.random_bodies.matter import Matter, Modes, modes_of
 from data_prep.random_bodies.motion import FiniteElements, MaterialPoints
 from data_prep.random_bodies.shapes import SHAPES, from_mesh
-from data_prep.synthetic.bodies import Array, Body
+from data_prep.synthetic.bodies import Array, Body, tet_volumes
 from data_prep.synthetic.bodies import _body as lattice
 from data_prep.synthetic.embedding import Embedding
 from gausim.data.corpus import MANIFEST, Corpus
