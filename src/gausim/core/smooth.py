@@ -18,7 +18,6 @@ class SmoothMotions:
     displacement_gradients: Float[Tensor, "N 3 3 M"]  # one per unit; the last row belongs to kernels that never move
     unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel: its row in ``displacement_gradients``
     sizes: Float[Tensor, " M"]  # amplitudes of the motions [typical displacements of the template]
-    vibrations: int | None = None  # the first so many vibrate, the others only follow them; None for all
 
     @property
     def count(self) -> int:
@@ -37,4 +36,4 @@ class SmoothMotions:
     def to(self, like: Tensor) -> SmoothMotions:
         """The same motions with the data type and device of ``like``."""
         kernels, gradients, sizes = (x.to(like) for x in (self.kernels, self.displacement_gradients, self.sizes))
-        return SmoothMotions(kernels, gradients, self.unit_of_kernel.to(like.device), sizes, self.vibrations)
+        return SmoothMotions(kernels, gradients, self.unit_of_kernel.to(like.device), sizes)

@@ -160,7 +160,8 @@ class ModalInitialStates(InitialStates):
                     f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
                     "Use gausim.models.initial_state.FreeInitialStates with it."
                 )
-            basis = (motions.kernels / motions.sizes)[..., : motions.vibrations if vibrations else None]
+            moving = model.template.vibrations(scene_id) if vibrations else None
+            basis = (motions.kernels / motions.sizes)[..., :moving]
             most = basis.norm(dim=1).amax(0).clamp_min(TINY)
             self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
         for scene_id, basis in enumerate(self._basis):

@@ -198,9 +198,8 @@ class SceneModel(nn.Module, ABC):
         axes = self.axes[scene_id].to(modes)
         modes = torch.einsum("ba,nbm->nam", axes, modes)
         slopes = torch.einsum("ca,ncdm,db->nabm", axes, slopes, axes)
-        own, vibrations = (modes, slopes, sizes), self.template.vibrations(scene_id)
-        scene, hierarchy = self.scenes[scene_id], self.hierarchies[scene_id]
-        return smooth_motions(scene, hierarchy, self.predicted_levels[-1], own, vibrations)
+        own = modes, slopes, sizes
+        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
 
     @torch.no_grad()
     def material(self, scene_id: int) -> dict[str, Property]:

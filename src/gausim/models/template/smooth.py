@@ -15,12 +15,10 @@ def smooth_motions(
     hierarchy: Hierarchy,
     finest: int,
     motions: tuple[Float[Tensor, "N 3 M"], Float[Tensor, "N 3 3 M"], Float[Tensor, " M"]],
-    vibrations: int | None = None,
 ) -> SmoothMotions:
     """Extends motions of units to their kernels: the unit's displacement plus its displacement gradient times offset.
 
     ``motions`` are displacements and displacement gradients of the units, and sizes (see ``SmoothMotions.sizes``).
-    The first ``vibrations`` of them vibrate by themselves; None for all.
     """
     modes, gradients, sizes = motions
     unit = hierarchy.ancestor(0, finest)
@@ -30,4 +28,4 @@ def smooth_motions(
     kernels[hierarchy.kernels] = moved * ~hierarchy.levels[0].pinned[:, None, None]
     still = torch.full((scene.count,), len(modes))
     rows = torch.cat((gradients, torch.zeros_like(gradients[:1])))
-    return SmoothMotions(kernels, rows, still.index_copy(0, hierarchy.kernels, unit), sizes, vibrations)
+    return SmoothMotions(kernels, rows, still.index_copy(0, hierarchy.kernels, unit), sizes)
