@@ -100,6 +100,22 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
     assert float(distances.mean()) == pytest.approx(later[-1], rel=1e-4)
 
 
+def test_the_fit_has_the_settings_of_the_model_and_what_it_leaves_is_said(
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[int] = []
+
+    def fit(model, motions, settings, groups, *, longest, updates, growing):
+        assert growing == 0.25 and settings.decay["scene"] == 0.05  # of model=gausim
+        seen.append(updates)
+        yield 0.2
+
+    monkeypatch.setattr(modal_fit, "fit", fit)
+    common = [f"data.root={toy}", "model=gausim", *QUICK, "trainer.max_epochs=1", "callbacks.warm_start.updates=60"]
+    assert train.main([*common, f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    assert seen == [60] and "without a network 0.200 of the motion is left" in capsys.readouterr().out
+
+
 def test_wrong_settings_are_refused() -> None:
     with pytest.raises(ConfigError, match="warm_start: expected updates, decay and later >= 0"):
         WarmStart(updates=-1)
