@@ -19,7 +19,8 @@ from gausim.compose.build import load_run
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import run_objects
 from gausim.core import Cameras, Renderer, SteppedFrame, Trajectory
-from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import Event, Force, Release, load_session, save_session
 from gausim.interaction.words import parse_direction, parse_part

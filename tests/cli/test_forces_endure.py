@@ -14,7 +14,8 @@ from msgspec.structs import replace
 from gausim.cli import train
 from gausim.compose.build import load_run
 from gausim.compose.live import ENERGY_ROOM, open_interaction
-from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Unit, Whole
 from gausim.interaction.session import Event, Force, Gravity, Impulse, Pin, Release, Unpin, Wind
 from gausim.ops.covariance import covariance_from_scales

@@ -9,7 +9,7 @@ import torch
 
 from gausim.core import ConfigError, HandPath
 from gausim.interaction.hands import MovedHands
-from gausim.interaction.interaction import replay
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Whole
 from gausim.interaction.session import Force, Hand
 from gausim.interaction.words import entry_of

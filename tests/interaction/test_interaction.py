@@ -10,7 +10,8 @@ import torch
 from msgspec.structs import replace as changed
 
 from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
-from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, MadeWith, Material, Pin, Release, Reset, Unpin, Wind
 from gausim.models.rollout.dynamics import SceneDynamics

@@ -19,7 +19,7 @@ from gausim.compose.config import compose
 from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.evaluation.corpus import BodyFigures, summary
-from gausim.interaction.interaction import replay as replay_session
+from gausim.interaction.replay import replay as replay_session
 from gausim.interaction.selections import Whole
 from gausim.interaction.session import Force, Material
 from gausim.io.ply import save_scene

@@ -18,7 +18,8 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 from viser.transforms import SO3
 
 from gausim.cli.view_subject import playable_run, subject_of
-from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Kernels
 from gausim.interaction.session import Force, Hand, Impulse, load_session, save_session
 from gausim.ops.orbit import orbit_cameras

@@ -21,7 +21,8 @@ import msgspec
 import zstandard
 
 from gausim.core import ConfigError, DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
-from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
 from gausim.models.template.template import Property

@@ -25,7 +25,8 @@ from gausim.data.images import composite
 from gausim.data.records import SequenceRecord
 from gausim.evaluation.evaluation import evaluate_object
 from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
-from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, replay
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.session import ForceSession, load_session, save_session
 from gausim.interaction.words import entries_of, has_forces
 from gausim.io.ply import load_scene

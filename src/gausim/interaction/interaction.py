@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 from gausim.core import (
     Adjustable,
     ConfigError,
-    DataError,
     DivergenceError,
     GaussianScene,
     Handled,
@@ -59,8 +58,6 @@ FARTHEST = 10.0
 FLATTEST = 1e-6
 # Gusts are a sum of waves of these frequencies [Hz].
 _GUSTS = (0.35, 0.8, 1.7)
-# Largest memory of a replayed trajectory [bytes].
-_MOST_BYTES = 8 << 30
 
 
 class Interaction:
@@ -223,9 +220,9 @@ class Interaction:
         found = [0.0] * 6 if self._hands is None else self._hands.places(self.frame_number)[number].tolist()
         return tuple(found[:3]), tuple(found[3:])
 
-    def trajectory(self) -> Trajectory:
-        """The kept frames, from the initial one or from the oldest that is kept."""
-        return trajectory_of(self._frames or [self.frame], self._stepper)
+    def trajectory(self, frames: Sequence[SteppedFrame] | None = None) -> Trajectory:
+        """The given frames of this session; by default the kept ones, from the initial or from the oldest kept."""
+        return trajectory_of(frames or self._frames or [self.frame], self._stepper)
 
     def session(self) -> ForceSession:
         """The session so far, with all recorded events."""
@@ -387,43 +384,3 @@ class Interaction:
                     f"{self.scene.name}: the covariance of kernel {int(carried[0])} is no longer positive definite at "
                     f"frame {number} (its unit {unit} is flattened). Reset, and use smaller forces."
                 )
-
-
-def replay(
-    interaction: Interaction,
-    session: ForceSession,
-    *,
-    other_model: bool = False,
-    watch: Callable[[Interaction], None] | None = None,
-) -> Trajectory:
-    """Replays a session from the initial state; all frames equal the recorded ones bit for bit.
-
-    Args:
-        interaction: the simulation, which begins a new session.
-        session: the events to replay.
-        other_model: accept another method or initial state than those of the session; results then differ.
-        watch: called with the interaction before every step, after its events, and after the last step.
-
-    Raises:
-        DataError: the session is of another scene, frame rate, method or initial state, or its frames exceed 8 GiB.
-        ConfigError: an event cannot be applied.
-        DivergenceError: the simulation diverges where the recorded one did not.
-    """
-    wrong = session.differences(interaction.made_with, interaction.fps)
-    if wrong and not (other_model and all(allowed for _, allowed in wrong)):
-        raise DataError("session: " + "; ".join(text for text, _ in wrong) + ". Replay it with what it was made with.")
-    frame = interaction.frame
-    size = session.steps * 4 * (frame.positions.numel() + 2 * frame.deformation_gradients.numel())
-    if size > _MOST_BYTES:
-        raise DataError(f"session: its {session.steps} frames take {size >> 30} GiB, expected at most 8. Shorten it.")
-    interaction.gravity, interaction.seed = session.gravity, session.seed
-    interaction.restart()
-    frames, pending = [interaction.frame], deque(session.entries)
-    for tick in range(session.steps + 1):
-        while pending and pending[0].at == tick:
-            interaction.act(pending.popleft().event)
-        if watch is not None:
-            watch(interaction)
-        if tick < session.steps:
-            frames.append(interaction.step())
-    return trajectory_of(frames, interaction._stepper)
