@@ -80,9 +80,8 @@ def test_wrong_options_are_explained(
     assert needle in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["gausim", "gausim_paper"])
-def test_the_default_hierarchy_is_that_of_the_models(option: str) -> None:
-    levels = compose("train", [f"model={option}"]).model.simulator.hierarchy.levels
+def test_the_default_hierarchy_is_that_of_the_model() -> None:
+    levels = compose("train", ["model=gausim"]).model.simulator.hierarchy.levels
     assert tuple(level.diameter for level in reversed(levels)) == command.DEFAULT_RADII
     assert more_settings()["model.simulator.hierarchy.clustering"] == command.DEFAULT_CLUSTERING
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gausim.models.hierarchy.clusters import Hierarchy
 
 # The hierarchy of the model configurations in conf/model; composing them here would be slow.
-DEFAULT_RADII = (0.13, 0.4)
+DEFAULT_RADII = (0.09, 0.4)
 DEFAULT_CLUSTERING = "agglomerative"
 PROPERTIES = ("stiffness", "density", "damping")
 
@@ -59,9 +59,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--save-masks", action="store_true", help="store the masks so that every command uses them")
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
         help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated "
-        "kernels' bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
+        "kernels' bounding box; default {:g} {:g}, as of model=gausim".format(*DEFAULT_RADII))  # fmt: skip
     add("--clustering", default=DEFAULT_CLUSTERING, choices=tuple(CLUSTERINGS),
-        help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
+        help="clustering method; default %(default)s, as of model=gausim")  # fmt: skip
     add("--up", choices=UPS,
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
     add("--out", metavar="PICTURE.png", type=Path,
