@@ -53,7 +53,7 @@ class Elasticity:
     offset: Float[Tensor, "K 3"]  # X_k - X_c [scene units]
     modes: Float[Tensor, "N 3 M"]  # displacements of units per mode, in the reference's axes; M may be 0
     slopes: Float[Tensor, "N 3 3 M"]  # and their gradients [1 / scene units]
-    matrices: tuple[Tensor, ...]  # M, K, D and N, each (M, M) [frame units]
+    matrices: tuple[Tensor, Tensor, Tensor, Tensor]  # M, K, D and N, each (M, M) [frame units]
     mass: Float[Tensor, ""]  # of the whole body, in the modes' units
     fraction: Float[Tensor, " K"]  # of every kernel, of the whole
     free: bool  # whether the body moves as a whole

@@ -64,7 +64,7 @@ class PreparedTemplate:
         """The template state at t + 1; for ``load`` see :class:`gausim.models.reference.reference.UnitMotion`."""
         return TemplateState(motion.rest, None)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor]:
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
         """How a member of the batch yields to impulses.
 
         Returns:
@@ -74,7 +74,7 @@ class PreparedTemplate:
         """
         count = self.spans[member].stop - self.spans[member].start
         none = torch.zeros(0, 0, device=self.device)
-        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none,) * 4, none.new_ones(())
+        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none, none, none, none), none.new_ones(())
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network; here all of it."""
@@ -187,7 +187,7 @@ class PreparedScenes(PreparedTemplate):
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], deformation)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor]:
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
         """How a member yields to impulses: by the modes of its scene."""
         part = next(part for part, _, members in self.parts if member in members)
         modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
