@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.models.hierarchy.clusters import Hierarchy
 
-# The hierarchy of the model configurations in conf/model; composing them here would be slow.
+# The hierarchy of conf/model/gausim.yaml; composing it here would be slow.
 DEFAULT_RADII = (0.09, 0.4)
 DEFAULT_CLUSTERING = "agglomerative"
 PROPERTIES = ("stiffness", "density", "damping")

@@ -16,7 +16,7 @@ impulse is shared among near points is almost undetermined, and its exact deriva
 
 After the frame the body has the deviation q and its velocity v. The trapezoidal step of a frame keeps the amplitude of
 every mode if it starts from q at t + 1 and, at t, from q - (N + K / 4)^-1 (K q / 2 + (M + N) v / 2), where N is the
-inertia in steps of a frame (:mod:`gausim.models.template.material`), about M for all but the fastest modes.
+inertia in steps of a frame (:mod:`gausim.models.template.periods`), about M for all but the fastest modes.
 """
 
 from __future__ import annotations

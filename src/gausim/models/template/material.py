@@ -160,7 +160,7 @@ class Matrices:
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     mass: Float[Tensor, "M M"]  # M (M, M)
     inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
-    frame_inertia: Float[Tensor, "M M"]  # the same for steps of a frame, with which they have the true periods (M, M)
+    frame_inertia: Float[Tensor, "M M"]  # the same for steps of a frame, another one with exact periods (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
     springs: Float[Tensor, " E"]  # k e^{g_ij} of every link, in units of S_ij (E,)
