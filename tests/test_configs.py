@@ -37,13 +37,16 @@ OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1 and path not
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
-GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol")
+GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol", "model_for_data")
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
 def compose_option(option: str) -> DictConfig:
     group, name = option_of(conf_dir() / f"{option}.yaml")
-    return compose("train", [f"{group}={name}", *(["model=gausim"] if group == "ablation" else [])])
+    overrides = [f"{group}={name}"]
+    if group == "model_for_data":
+        overrides = [f"{key}={value}" for key, value in zip(("model", "data"), name.rsplit("_", 1), strict=True)]
+    return compose("train", [*overrides, *(["model=gausim"] if group == "ablation" else [])])
 
 
 def targets(node: Any) -> Iterator[DictConfig]:
@@ -132,6 +135,15 @@ def test_settings_that_no_configuration_lists_are_the_constructors_defaults() ->
         takers = [inspect.signature(hydra.utils.get_object(target)).parameters for target in place.targets]
         defaults = [parameters[name].default for parameters in takers if name in parameters]
         assert defaults and all((list(d) if isinstance(d, tuple) else d) == value for d in defaults), key
+
+
+def test_a_model_has_its_settings_for_a_data_set_which_an_ablation_may_change() -> None:
+    def levels(*overrides: str) -> list[float]:
+        return [level.diameter for level in compose("train", list(overrides)).model.simulator.hierarchy.levels]
+
+    assert levels("model=gausim") == [0.4, 0.09]
+    assert levels("model=gausim", "protocol=bunny_development") == [0.4, 0.13]
+    assert levels("experiment=bunny", "model=gausim", "ablation=no_hierarchy") == [0.0]
 
 
 def test_settings_that_no_configuration_lists_are_set_like_others(capsys: pytest.CaptureFixture[str]) -> None:
