@@ -105,11 +105,9 @@ def test_a_turned_and_moved_scene_gives_turned_and_moved_motion(sees_floor: bool
         assert far < most * scene.diagonal
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters(exact: bool) -> None:
+def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
     scene = _block(free=True, gravity=(0.0, 0.0, FALL), floor=FLOOR)
     model = _frozen(scene)
-    model.template.exact_periods = exact
     mass, _ = model.masses(model.batch((0,)))
     states = _steps(model, SimState(scene.means, scene.means), 60)
     heights = torch.stack([(mass / mass.sum()) @ s.positions[:, 2] for s in states])

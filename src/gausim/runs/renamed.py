@@ -48,7 +48,7 @@ SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 # Removed settings of which one value is still supported; a false value stands for all false values.
 UNSUPPORTED: dict[str, dict[str, Any]] = {
     "Objective": {"input_noise": None},
-    "MaterialTemplate": {"named_attributes": True},
+    "MaterialTemplate": {"named_attributes": True, "exact_periods": None},
     "Filling": {"ray_axis": None, "open_side": None, "seed": None},
     **dict.fromkeys(("PointSupervision", "TrackSupervision"), {"velocity_weight": None}),
     "ModulusField": {"parametrisation": "log"},

@@ -15,8 +15,7 @@ those of the linear equations that hold as long as the same points press, stick 
 impulse is shared among near points is almost undetermined, and its exact derivatives would drown all others.
 
 After the frame the body has the deviation q and its velocity v. The trapezoidal step of a frame keeps the amplitude of
-every mode if it starts from q at t + 1 and, at t, from q - (N + K / 4)^-1 (K q / 2 + (M + N) v / 2), where N is the
-inertia in steps of a frame (:mod:`gausim.models.template.periods`), about M for all but the fastest modes.
+every mode if it starts from q at t + 1 and, at t, from q - (M + K / 4)^-1 (K q / 2 + M v).
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ class Elasticity:
     offset: Float[Tensor, "K 3"]  # X_k - X_c [scene units]
     modes: Float[Tensor, "N 3 M"]  # displacements of units per mode, in the reference's axes; M may be 0
     slopes: Float[Tensor, "N 3 3 M"]  # and their gradients [1 / scene units]
-    matrices: tuple[Tensor, Tensor, Tensor, Tensor]  # M, K, D and N, each (M, M) [frame units]
+    matrices: tuple[Tensor, Tensor, Tensor]  # inertia, stiffness and damping, each (M, M) [frame units]
     mass: Float[Tensor, ""]  # of the whole body, in the modes' units
     fraction: Float[Tensor, " K"]  # of every kernel, of the whole
     free: bool  # whether the body moves as a whole
@@ -69,23 +68,22 @@ class Coordinates:
     inertia: Float[Tensor, "C C"]
     stiffness: Float[Tensor, "C C"]
     damping: Float[Tensor, "C C"]
-    frame_inertia: Float[Tensor, "C C"]
 
     @classmethod
     def of(
         cls, body: Elasticity, positions: Float[Tensor, "K 3"], rotation: Float[Tensor, "3 3"], centre: Tensor | None
     ) -> Coordinates:
         """The coordinates about the ``positions`` of a frame."""
-        inertia, stiffness, damping, frame_inertia = body.matrices
+        inertia, stiffness, damping = body.matrices
         if body.free and centre is not None:
             arm = positions - centre
             square = (body.fraction * arm.square().sum(-1)).sum()
             turning = square * torch.eye(3).to(arm) - arm.mT @ (body.fraction[:, None] * arm)
             none = arm.new_zeros(6, 6)
             rigid = torch.block_diag(torch.eye(3).to(arm), turning) * body.mass
-            added = (rigid, none, none, rigid)
-            inertia, stiffness, damping, frame_inertia = map(torch.block_diag, body.matrices, added)
-        return cls(body, rotation, centre, inertia, stiffness, damping, frame_inertia)
+            inertia = torch.block_diag(inertia, rigid)
+            stiffness, damping = torch.block_diag(stiffness, none), torch.block_diag(damping, none)
+        return cls(body, rotation, centre, inertia, stiffness, damping)
 
     def jacobian(
         self, points: Int[Tensor, " P"], positions: Float[Tensor, "K 3"], axes: Float[Tensor, "3 3"]
@@ -195,9 +193,7 @@ class Contact:
             q, last = ahead + response @ (jacobian.mT @ p), q
             before, place = place, path.flatten() + jacobian @ q
         speed = (q - last) / h - 0.5 * h * torch.linalg.solve(inertia, stiffness @ q + damping @ (q - last) / h)
-        frame = coordinates.frame_inertia
-        momentum = (inertia + frame) @ speed / 2
-        seen = torch.linalg.solve(frame + stiffness / 4, 0.5 * (stiffness @ q) + momentum)
+        seen = torch.linalg.solve(inertia + stiffness / 4, 0.5 * (stiffness @ q) + inertia @ speed)
         return q, q - seen
 
     def _wanted(self, reached: Tensor, place: Tensor, before: Tensor) -> Float[Tensor, " P3"]:

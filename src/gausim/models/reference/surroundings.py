@@ -117,7 +117,7 @@ def reference_of(
 
 def _elasticity(
     template: PreparedTemplate, member: int, axes: Tensor | None
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
     """Modes and slopes in scene axes, matrices and mass."""
     modes, slopes, matrices, mass = template.yielding(member)
     if axes is None:

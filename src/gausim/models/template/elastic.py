@@ -143,7 +143,7 @@ class PreparedElastic(ModalScene):
         root, (stretch, mixing) = scene.inertia_root(), scene.roots()
         pull = (stretch[:, None] * mixing).mT @ root
         self.inertia, self.stiffness = root.mT @ root, pull.mT @ pull
-        self.mass = self.inertia_within = self.inertia
+        self.mass = self.inertia
         self.damping = root.mT @ scene.dissipation() @ root
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:

@@ -23,10 +23,12 @@ velocity round instead of stopping it. What is nonlinear are either the cells of
 (finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
 :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
 the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
-common (:class:`gausim.models.template.modal.ModalScene`). In such steps inertia is another one
-(:mod:`gausim.models.template.periods`). K, M and D are positive semi-definite for all decoded values, so that a step
-never creates energy, and without damping it conserves energy. It does not amplify vibrations too fast for the frame
-rate. The decoders' only geometric input are distances, so that they generalise to other bodies and orientations.
+common (:class:`gausim.models.template.modal.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
+where a step can neither follow nor damp them and they tremble on. What they do is to follow other modes, and they still
+do with inertia max(0, K_mm / w^2 - M_mm) more, with which none swings faster than w, twice in a frame. K, M and D are
+positive semi-definite for all decoded values, so that a step never creates energy, and without damping it conserves
+energy. It does not amplify vibrations too fast for the frame rate. The decoders' only geometric input are distances, so
+that they generalise to other bodies and orientations.
 """
 
 from __future__ import annotations
@@ -47,7 +49,6 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.modal import ModalScene, force_of_strain
-from gausim.models.template.periods import shortening, slowed
 from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
 from gausim.models.template.template import DENSITY, PreparedScenes, Property, Template
@@ -57,6 +58,8 @@ from gausim.nn.mlp import mlp
 LARGEST_LOG = 2.5
 # Lowest modes of which derivatives are among the modes of a body with finite strain: 21 of 48.
 CURVED = 6
+# Largest angular frequency of a mode of a body with finite strain: two swings a frame [1 / frame].
+FASTEST = 4 * math.pi
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
@@ -160,7 +163,6 @@ class Matrices:
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     mass: Float[Tensor, "M M"]  # M (M, M)
     inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
-    frame_inertia: Float[Tensor, "M M"]  # the same for steps of a frame, another one with exact periods (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
     springs: Float[Tensor, " E"]  # k e^{g_ij} of every link, in units of S_ij (E,)
@@ -189,7 +191,6 @@ class MaterialTemplate(Template):
         solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
         finite_strain: bool = False,
-        exact_periods: bool = False,
         hidden: int = 48,
         period: float = 8.0,
         damping: float = 0.02,
@@ -206,7 +207,6 @@ class MaterialTemplate(Template):
             solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
             finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
-            exact_periods: of vibrations up to the frame rate; else those of the trapezoidal rule, which are longer.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
@@ -220,7 +220,7 @@ class MaterialTemplate(Template):
             raise ConfigError(
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
-        self.conserve_volume, self.exact_periods = conserve_volume, exact_periods
+        self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
         made = partial(
             BodyModes, finest=finest, modes=modes, solid=SolidSettings.of(solid), links=self.links.neighbours,
@@ -278,18 +278,13 @@ class MaterialTemplate(Template):
         rate = dragged.trace() / inertia.trace()
         mass = inertia
         if body.cells is not None:
-            inertia, dragged = slowed(k * stiffness, inertia, dragged, rate)
-        frame_inertia = inertia
-        if self.exact_periods:
-            shorter = shortening(inertia, k * stiffness)
-            frame_inertia, dragged = (shorter.mT @ x @ shorter for x in (inertia, dragged))
-            if body.cells is not None:
-                frame_inertia, dragged = slowed(k * stiffness, frame_inertia, dragged, rate)
+            slowed = ((k * stiffness).diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
+            inertia, dragged = mass + slowed, dragged + rate * slowed
         damping = dragged + (rate / 4 + viscosity / frame) * k * stiffness
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
         return Matrices(
-            k * stiffness, mass, inertia, frame_inertia, damping, k * cells, k * springs, density, between,
-            k * (cells - 1), tense, self.links.damping / frame,
+            k * stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1), tense,
+            self.links.damping / frame,
         )  # fmt: skip
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
@@ -360,7 +355,7 @@ class PreparedMaterial(ModalScene):
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.positions = matrices, body.modes.flatten(0, 1)
         self.body, self.values, self.reference = body, body.values, reference
-        self.mass, self.inertia, self.inertia_within = matrices.mass, matrices.frame_inertia, matrices.inertia
+        self.mass, self.inertia = matrices.mass, matrices.inertia
         self.stiffness, self.damping = matrices.stiffness, matrices.damping
         self.nonlinear, self.factor, self.growth = body.springs, matrices.springs, matrices.growth
         if body.cells is not None:

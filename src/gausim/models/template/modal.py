@@ -40,8 +40,7 @@ class ModalScene:
     """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
     mass: Float[Tensor, "M M"]  # modal mass [frame units]
-    inertia: Float[Tensor, "M M"]  # modal inertia in steps of a frame: the mass, but where a template corrects periods
-    inertia_within: Float[Tensor, "M M"]  # the same for motions within a frame
+    inertia: Float[Tensor, "M M"]  # modal inertia: the mass, but where a template slows modes too fast for frames
     stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
     damping: Float[Tensor, "M M"]  # modal damping
     nonlinear: NonlinearForce  # of springs, or of finite strain
@@ -121,10 +120,10 @@ class ModalScene:
         """The part of a displacement by an impulse that its frame does not reach.
 
         Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t), M after the inverse being the mass.
-        A mode of angular frequency w, which turns by a in a step, thus begins with v (sin(a / 2) / (w / 2))^2 of a
-        velocity v, with which a steady force moves it from frame to frame as it does in continuous time. With all of v
-        modes far above the frame rate would turn round by v in every frame. 1 - t is what damping leaves of it in this
-        step, for the slow modes: with it, a steady force ends where stiffness balances it.
+        A mode of angular frequency w that gets a velocity v thus begins with v / (1 + w^2 / 4), with which a motion of
+        the trapezoidal rule is as large as the true one, v / w. With all of v modes far above the frame rate would turn
+        round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
+        steady force ends where stiffness balances it.
         """
         whole = self.inertia + self.stiffness / 4
         inverse, slow = (torch.linalg.inv_ex(a)[0] for a in (whole, self.stiffness))  # without waiting for a device

@@ -64,17 +64,16 @@ class PreparedTemplate:
         """The template state at t + 1; for ``load`` see :class:`gausim.models.reference.reference.UnitMotion`."""
         return TemplateState(motion.rest, None)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member of the batch yields to impulses.
 
         Returns:
-            Modes (N, 3, M) and their gradients (N, 3, 3, M); inertia of motions within a frame, stiffness, damping, and
-            inertia in steps of a frame (M, M) [frame units]; and the mass of the body in the modes' units; here the
-            body is rigid, M = 0.
+            Modes (N, 3, M) and their gradients (N, 3, 3, M); inertia, stiffness and damping (M, M) [frame units];
+            and the mass of the body in the modes' units; here the body is rigid, M = 0.
         """
         count = self.spans[member].stop - self.spans[member].start
         none = torch.zeros(0, 0, device=self.device)
-        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none, none, none, none), none.new_ones(())
+        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none, none, none), none.new_ones(())
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network; here all of it."""
@@ -187,13 +186,12 @@ class PreparedScenes(PreparedTemplate):
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], deformation)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member yields to impulses: by the modes of its scene."""
         part = next(part for part, _, members in self.parts if member in members)
         modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
         mass = part.mass.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
-        matrices = part.inertia_within, part.stiffness, part.damping, part.inertia
-        return modes, slopes.unflatten(1, (3, 3)), matrices, mass
+        return modes, slopes.unflatten(1, (3, 3)), (part.inertia, part.stiffness, part.damping), mass
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network, scene by scene."""
