@@ -23,7 +23,7 @@ MOST_TURNS = 8
 # Most steps of the compared rollouts, and frames between their beginnings.
 STEPS, APART = 4, 2
 # Updates of the fit of a body, its learning rate, and most beginnings of rollouts of every sequence in one of them.
-UPDATES, RATE, BEGINNINGS = 500, 0.1, 4
+UPDATES, RATE, BEGINNINGS = 200, 0.1, 4
 
 
 def find_materials(model: GausSim, data: CorpusDataModule) -> None:
