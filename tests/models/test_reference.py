@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -116,6 +117,13 @@ def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
     lowest = min(float(FLOOR.height(s.positions).min()) for s in states)
     assert -1e-3 * scene.diagonal < lowest < 0.01 * scene.diagonal
     assert heights[45:].std() < 0.02 * scene.diagonal  # it has come to rest
+
+
+def test_a_free_body_may_have_more_modes_than_a_held_one() -> None:
+    held = replace(_block(), pinned=torch.arange(220) < 20)
+    template = partial(NEURAL["template"], free_modes=2)
+    model = make_model([_block(free=True), held], **(NEURAL | {"template": template}))
+    assert [model.modal_projection(i).shape[-1] for i in (0, 1)] == [18, 9]
 
 
 def test_units_see_how_near_the_floor_is_and_where(monkeypatch: pytest.MonkeyPatch) -> None:

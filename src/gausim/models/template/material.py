@@ -188,6 +188,7 @@ class MaterialTemplate(Template):
         attributes: int,
         frames: Sequence[np.ndarray],
         modes: int = 48,
+        free_modes: int = 1,
         solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
         finite_strain: bool = False,
@@ -204,6 +205,8 @@ class MaterialTemplate(Template):
             attributes: number of attributes per unit.
             frames: axes (3, 3) of each scene in which the template works.
             modes: number of modes.
+            free_modes: how many times as many modes a body has that nothing holds. An impact deforms it where it
+                touches the floor, which takes more modes than to swing about a hold.
             solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
             finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
@@ -223,10 +226,12 @@ class MaterialTemplate(Template):
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
         made = partial(
-            BodyModes, finest=finest, modes=modes, solid=SolidSettings.of(solid), links=self.links.neighbours,
-            finite=finite_strain,
-        )  # fmt: skip
-        self.bodies = nn.ModuleList(made(h, frame=f) for h, f in zip(hierarchies, frames, strict=True))
+            BodyModes, finest=finest, solid=SolidSettings.of(solid), links=self.links.neighbours, finite=finite_strain
+        )
+        counts = [modes * (1 if h.levels[0].pinned.any() else free_modes) for h in hierarchies]
+        self.bodies = nn.ModuleList(
+            made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)
+        )
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 3))
