@@ -11,6 +11,7 @@ from helpers.report_runs import config, evaluate, make_curves, write_run
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import Study, make_study
 from gausim.report.opening import first_table
+from gausim.report.records.measure import measured_record
 from gausim.report.tables.motion import bounce_sheets, horizon_sheets
 from gausim.report.tables.verdict import outcome, sentences
 
@@ -36,6 +37,13 @@ def test_bounces_of_methods_references_and_the_truth(tmp_path):
     rows = {line.label: [entry.text for entry in line.entries] for line in sheet.lines}
     assert rows["gausim"] == ["0.450", "10.0 %", "0.200", "25.0 %", "0.30"]
     assert rows["ballistic"][2] == "–" and rows["truth"][1] == "0.0 %"
+
+
+def test_records_have_the_bounce_with_its_deviation_over_seeds(tmp_path):
+    table = measured_record(study(tmp_path), "Falling").table("toy_bunny_bounce")
+    rows = {row.label[0]: row.cells for row in table.rows}
+    assert [cell.mean for cell in rows["gausim"]] == pytest.approx([0.45, 10.0, 0.2, 25.0, 0.3])
+    assert rows["gausim"][0].seeds == [0.4, 0.5] and rows["ballistic"][2] is None and rows["truth"][3].mean == 0.0
 
 
 def test_errors_by_frames_ahead(tmp_path):

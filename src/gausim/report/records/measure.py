@@ -12,7 +12,7 @@ from gausim.report.gather.study import FULL, Group, Study, cell, deviation, effe
 from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row, value_of
-from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
+from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC, TRUTH
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import GROUP_TITLES, NO_FORESIGHT, SPLIT_TITLES, footnotes_of, reference_row
 
@@ -32,6 +32,14 @@ _COSTS = (
     Column("per frame [s]", 4),
     Column("prediction, memory [MB]", 1),
 )
+# The first bounce of a body on a floor, see :mod:`gausim.results.summary`: scale and column.
+_BOUNCE = {
+    "height": (1.0, Column("highest point after the impact [scene units]", 3)),
+    "height_error": (100.0, Column("its error [%]", 1, "low")),
+    "rise": (1.0, Column("rise [scene units]", 3)),
+    "rise_error": (100.0, Column("its error [%]", 1, "low")),
+    "depth": (1.0, Column("deepest below the floor [% of the diagonal]", 2)),
+}
 # Columns of an ablation table: metric, views, frames.
 _ABLATED = (
     ("l2", "train", "seen"), ("l2", "train", "unseen"), ("lpips", "train", "unseen"), ("l2", "heldout", "unseen"),
@@ -43,7 +51,7 @@ def measured_record(study: Study, title: str) -> Record:
     """The record of a study.
 
     It has a summary of several objects, then per object a comparison on unseen frames with the cost, the 3D error by
-    frames ahead, and every metric.
+    frames ahead, the first bounce on a floor, and every metric.
     """
     runs = [run for group in study.groups for run in group.evaluated]
     made = Made(
@@ -81,20 +89,37 @@ def _summary(study: Study) -> Iterator[RecordTable]:
 
 def _ahead(study: Study, name: str) -> Iterator[RecordTable]:
     """3D errors by frames ahead, where the true motion is known beyond the seen frames."""
-    groups = [group for group in study.groups if group.entries(name)]
-    entries = [entry for group in groups for _, entry in group.entries(name)]
+    entries = [entry for group in study.groups for _, entry in group.entries(name)]
     frames = list(dict.fromkeys(n for entry in entries for n in dig(entry, "horizon", "frames") or ()))
-    rows = []
-    for group, row in [*((g, g.method) for g in groups), *((groups[0], row) for row in _references(groups, name))]:
-        found = [e for _, e in group.entries(name)][: None if row == group.method else 1]
-        own = [_ahead_of(entry, row) for entry in found]
-        cells = [_over_seeds([series.get(n) for series in own], 1.0) for n in frames]
-        label = group.label if row == group.method else row
-        rows.append(Row([label], cells, reference=row != group.method and row not in (STATIC, FOLLOW_HANDS)))
-    if rows := [row for row in rows if any(cell is not None for cell in row.cells)]:
+    if rows := _rows(study, name, _ahead_of, {n: 1.0 for n in frames}):
         columns = [Column(f"+{n}", 2, "low") for n in frames]
         title = f"{name}, 3D error [% of the diagonal] by frames after the last seen one"
         yield RecordTable(f"{name}_ahead", columns, rows, title=title, caption="± deviation over seeds.")
+
+
+def _bounces(study: Study, name: str) -> Iterator[RecordTable]:
+    """The first bounce of a body that falls on a floor, the truth last."""
+
+    def read(entry: dict[str, Any], row: str) -> dict[str, Any]:
+        return dig(entry, "bounce", row) or {}
+
+    if rows := _rows(study, name, read, {key: scale for key, (scale, _) in _BOUNCE.items()}, TRUTH):
+        columns = [column for _, column in _BOUNCE.values()]
+        title = f"{name}, its centre after the first contact with the floor"
+        yield RecordTable(f"{name}_bounce", columns, rows, title=title, caption="± deviation over seeds.")
+
+
+def _rows(study: Study, name: str, read: Any, scales: dict[Any, float], *more: str) -> list[Row]:
+    """Rows of methods over their seeds, of references and ``more``; ``read(entry, row)`` has figures by key."""
+    groups = [group for group in study.groups if group.entries(name)]
+    others = (*_references(groups, name), *more) if groups else ()
+    rows = []
+    for group, row in [*((g, g.method) for g in groups), *((groups[0], row) for row in others)]:
+        found = [read(entry, row) for _, entry in group.entries(name)][: None if row == group.method else 1]
+        cells = [_over_seeds([own.get(key) for own in found], scale) for key, scale in scales.items()]
+        label = group.label if row == group.method else row
+        rows.append(Row([label], cells, reference=row != group.method and row not in (STATIC, FOLLOW_HANDS)))
+    return [row for row in rows if any(cell is not None for cell in row.cells)]
 
 
 def _ahead_of(entry: dict[str, Any], row: str) -> dict[int, Any]:
@@ -112,6 +137,7 @@ def _tables(study: Study, name: str) -> Iterator[RecordTable]:
         first.key, first.title = f"{name}_comparison", f"{name}, {_frames(last, splits)}"
         yield first
     yield from _ahead(study, name)
+    yield from _bounces(study, name)
     yield from _ablations(study, name)
     for split in splits:
         for views, place in GROUP_TITLES.items():
