@@ -18,10 +18,13 @@ def test_every_figure_of_the_step_is_reported(memory: int, monkeypatch, capsys) 
     rows = step.run(QUICK, simulator_of)
     found = {(row.case, row.metric): row.value for row in rows}
     assert len(found) == len(rows)
-    paper, flat = list(dict.fromkeys(row.case for row in rows))
+    paper, flat, elastic, neural = list(dict.fromkeys(row.case for row in rows))
     assert paper.startswith("step, 120 kernels") and flat.endswith("no hierarchy")
     assert all(found[paper, metric] > 0 for metric in ("forward", "forward + backward"))
     assert found[flat, "edges"] > found[paper, "edges"] > 0
+    assert elastic.endswith(" units, gausim_elastic") and neural.endswith(" units, gausim")
+    times = [found[case, "forward + backward"] for case in (neural, elastic)]
+    assert found[neural, "forward + backward / elastic"] == pytest.approx(times[0] / times[1])
     said = capsys.readouterr().err
     for metric in ("forward + backward", "kept for the backward pass"):
         assert ((flat, f"{metric} / with hierarchy") in found) == bool(memory) == ("no backward pass" not in said)

@@ -1,4 +1,4 @@
-"""Benchmark of one predicted frame without rendering, with and without hierarchy."""
+"""Benchmark of one predicted frame without rendering: the paper's simulator with and without hierarchy, and others."""
 
 from __future__ import annotations
 
@@ -40,10 +40,14 @@ QUICK = Size(400, (40, 6), ("network.hidden=16", "network.layers=2"))
 
 
 def run(options: Options, build: Build) -> list[Row]:
-    """Times and memory of the graph, with the scene's hierarchy and with every kernel predicted."""
+    """Times and memory of the paper's simulator, with the scene's hierarchy and with every kernel predicted.
+
+    Then those of the neural simulator beside the elastic model's, each with its own hierarchy and network.
+    """
     size = QUICK if options.quick else Size()
     with torch_threads(options.threads):
-        return _frame(size, options, build)
+        scene = cloud(size.kernels, "paper")
+        return [*_frame(scene, size, options, build), *_neural(scene, options, build)]
 
 
 def cloud(count: int, name: str, *, degree: int = 1) -> GaussianScene:
@@ -82,8 +86,22 @@ def levels_of(scene: GaussianScene, units: Sequence[int]) -> str:
     return f"hierarchy.levels=[{','.join(f'{{diameter:{d},edge_length:{length}}}' for d, length in pairs)}]"
 
 
-def _frame(size: Size, options: Options, build: Build) -> list[Row]:
-    scene = cloud(size.kernels, "paper")
+def _neural(scene: GaussianScene, options: Options, build: Build) -> list[Row]:
+    rows, found = [], dict[str, dict[str, float]]()
+    for preset in ("gausim_elastic", "gausim"):
+        bound = Bound(build(preset, scene), options)
+        case = f"step, {scene.count} kernels, {bound.units} units, {preset}"
+        times = medians({"forward": bound.forward, "forward + backward": bound.both}, options)
+        found[preset] = times | {"kept for the backward pass": float(peak_saved_bytes(bound.differentiable))}
+        for metric, value in found[preset].items():
+            shown = (1e3 * value, "ms") if metric in times else (value / 2**20, "MiB")
+            rows.append(Row(case, metric, *shown))
+    elastic, neural = found.values()
+    note = "a training prepares its matrices once for all frames of a rollout"
+    return rows + [Row(case, f"{m} / elastic", neural[m] / elastic[m], "x", note) for m in neural]
+
+
+def _frame(scene: GaussianScene, size: Size, options: Options, build: Build) -> list[Row]:
     bound = Bound(build("gausim_paper", scene, levels_of(scene, size.units), *size.network), options)
     case = f"step, {size.kernels} kernels, {bound.units} units"
     times = medians({"forward": bound.forward, "forward + backward": bound.both}, options)
