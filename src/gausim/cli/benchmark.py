@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 CASES = {
     "render": "the CPU renderer against plain torch, threads, views, compilation",
-    "step": "one predicted frame at the paper's size, with and without hierarchy",
+    "step": "one predicted frame at the paper's size, with and without hierarchy, and of the other models",
     "train": "whole optimiser steps, part by part, against elastic ones; KEY=VALUE as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed about: simulated frames per second, from the force to the browser's bytes",
