@@ -15,6 +15,7 @@ from gausim.models.reference.floor import COMPLIANCE, Contact, _projected_gradie
 from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.predictor import with_floor_columns
+from gausim.models.template.solid import SolidSettings
 from gausim.ops.rotation import cross_matrix, rotation_of, rotation_vector
 
 TURN = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
@@ -34,7 +35,7 @@ def _block(count: int = 220, **surroundings) -> GaussianScene:
 
 
 def _frozen(scene: GaussianScene, **options):
-    return make_model(scene, **NEURAL, **options).double().eval().requires_grad_(False)
+    return make_model(scene, **(NEURAL | options)).double().eval().requires_grad_(False)
 
 
 def _thrown(scene: GaussianScene, speed: float = 1.0) -> SimState:
@@ -272,7 +273,7 @@ def test_the_static_shape_of_a_recorded_pose_is_computed_once() -> None:
 
 def test_a_bar_pulled_apart_comes_to_rest_stretched_evenly_and_thinner() -> None:
     scene = _bar()
-    model = _frozen(scene)
+    model = _frozen(scene, template=partial(NEURAL["template"], solid=SolidSettings(0.12, held_inside=True)))
     apart = torch.tensor([0.2, 0.0, 0.0]).double()
     path = _path(lambda f, x: x + min(f / 20, 1.0) * apart * (x[:, :1] > 1))
     made = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 120, hands=path.pose).positions[-1]

@@ -35,7 +35,7 @@ MOST_POSES = 4096
 class StaticShape:
     """The reference of the units of one scene, as a function of where its hands are; computed once per scene."""
 
-    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, *, spacing: float = 0.12) -> None:
+    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, *, spacing: float) -> None:
         """Computes the static modes; ``spacing`` of their grid is in diagonals."""
         own, level = scene.means[hierarchy.kernels], hierarchy.levels[finest]
         pinned = scene.pinned[hierarchy.kernels]

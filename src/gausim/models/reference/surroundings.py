@@ -42,13 +42,14 @@ class SceneSurroundings(nn.Module):
             self.friction = nn.Parameter(torch.tensor(math.log(math.expm1(FRICTION))))
         if floor is not None and floor.restitution is None:
             self.restitution = nn.Parameter(torch.logit(torch.tensor(RESTITUTION)))
+        self.spacing = 0.12  # of the grid of the static shape [diagonals]
         self.moves = not self.facts.still or scene.hand is not None
         self._built_from = scene, hierarchy, finest
 
     @cached_property
     def shape(self) -> StaticShape | None:
         """The static shape of a body in hands or pins; None for a free body."""
-        return None if self.facts.free else StaticShape(*self._built_from)
+        return None if self.facts.free else StaticShape(*self._built_from, spacing=self.spacing)
 
     def acceleration(self, dt: float, like: Tensor) -> Float[Tensor, " 3"]:
         """Gravity [scene units / frame^2]."""

@@ -113,6 +113,11 @@ class SceneModel(nn.Module, ABC):
         axes = None if frames is None else frames.axes[-1]
         return reference_of(own, batch, mass, replace(units, rest=rest), template, axes, driven=driven)
 
+    def resolve_shapes(self, spacing: float) -> None:
+        """Has static shapes of bodies in hands computed on grids of this spacing [diagonals]."""
+        for own in self.surroundings:
+            cast(SceneSurroundings, own).spacing = spacing
+
     def frames(self, batch: SceneBatch) -> Frames | None:
         """Body axes for every unit of a batch; None where scene axes are used."""
         return Frames.of(batch, self.axes, self.origins) if self._in_body_frame else None

@@ -225,9 +225,9 @@ class MaterialTemplate(Template):
             )
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
-        made = partial(
-            BodyModes, finest=finest, solid=SolidSettings.of(solid), links=self.links.neighbours, finite=finite_strain
-        )
+        body = SolidSettings.of(solid)
+        self.spacing = body.spacing
+        made = partial(BodyModes, finest=finest, solid=body, links=self.links.neighbours, finite=finite_strain)
         counts = [modes * (1 if h.levels[0].pinned.any() else free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
             made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)

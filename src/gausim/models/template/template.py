@@ -115,10 +115,11 @@ class Template(nn.Module, ABC):
         has_energy: whether the result of :meth:`prepare` has an energy, as that of :class:`PreparedScenes`.
         headroom: factor on the initial energy of a rollout, the energy guard's limit in its first frames.
         is_shared: whether the parameters are common to all scenes, like the network's, or separate per scene.
+        spacing: of the grid on which the static shape of a body in hands is computed [diagonals].
     """
 
     has_energy, is_shared = False, False
-    headroom = 1.0
+    headroom, spacing = 1.0, 0.12
 
     @abstractmethod
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
