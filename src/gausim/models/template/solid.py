@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
-from scipy.sparse.linalg import LinearOperator, eigsh, factorized
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from scipy.spatial import cKDTree
 
 from gausim.models.template.grid import FIRST, SECOND, Grid, by_component, cells, matrix, rigid_motions, stiffness
@@ -28,6 +30,8 @@ NO_SUPPORT = 1e-9
 # Stiffness of springs on all nodes, as a fraction of the median: parts without a connection to a pin could move freely,
 # and the equations would be singular.
 FOUNDATION = 1e-8
+# Displacements (D, ...) of a body under forces (D, ...).
+Solver = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -154,11 +158,12 @@ def solid_body(
     root = np.tile(np.sqrt(mass[~pinned]), 3)
     rigid = None if held.any() else grid.rigid_coefficients()[used]
     whole, carry = whole[used][:, used], sp.diags(root) @ carry
-    eigenvalues, vectors = lowest(whole, carry, modes, rigid)
+    solve = _solver(whole)
+    eigenvalues, vectors = lowest(solve, carry, modes, rigid)
     vibrations = len(eigenvalues)
     if curved:
         found = SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
-        bent = derivatives(found, curved, whole, used, carry, rigid)
+        bent = derivatives(found, curved, solve, used, carry, rigid)
         eigenvalues, vectors, vibrations = _joined(vectors, bent, whole, carry)
     return SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
 
@@ -171,9 +176,11 @@ def _full(vectors: np.ndarray, used: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def derivatives(
-    body: SolidBody, count: int, whole: sp.spmatrix, used: np.ndarray, carry: sp.spmatrix, rigid: np.ndarray | None
+    body: SolidBody, count: int, solve: Solver, used: np.ndarray, carry: sp.spmatrix, rigid: np.ndarray | None
 ) -> np.ndarray:
     """Modal derivatives (D, P): static answers to the second-order forces of pairs of the ``count`` lowest modes.
+
+    ``solve`` gives displacements (D, ...) of forces.
 
     A body that bends far also shortens; linear modes cannot say so, and finite strain in them is far too stiff. What
     is missing solves K x = -Q(H_i, H_j), Q the part of the forces of finite strain that is quadratic in the
@@ -183,7 +190,7 @@ def derivatives(
     slopes = [matrix(nodes, gradients[..., a], body.grid.size) for a in range(3)]
     h = np.moveaxis(body.at(body.centres)[1][..., :count], -1, 0)  # (count, Q, 3, 3)
     stress = [_stress(x) for x in h]
-    solve, found = factorized(whole.tocsc()), []
+    loads = []
     for i, j in itertools.combinations_with_replacement(range(len(h)), 2):
         force = _stress(h[i].transpose(0, 2, 1) @ h[j]) + h[i] @ stress[j] + h[j] @ stress[i]
         force *= body.weights[:, None, None]
@@ -191,8 +198,8 @@ def derivatives(
         if rigid is not None:  # free of what would accelerate the whole body
             moved = carry @ rigid
             load -= carry.T @ (moved @ np.linalg.solve(moved.T @ moved, rigid.T @ load))
-        found.append(solve(load) / np.sqrt(body.values[i] * body.values[j]))
-    x = np.stack(found, 1)
+        loads.append(load / np.sqrt(body.values[i] * body.values[j]))
+    x = solve(np.stack(loads, 1))
     if rigid is not None:
         x -= rigid @ np.linalg.lstsq(carry @ rigid, carry @ x, rcond=None)[0]
     return x
@@ -281,29 +288,34 @@ def static_responses(
     body = _assembled(kernels, hand >= 0, spacing)
     grid, whole, of = body.grid, body.stiffness, hand[body.holders]
     used = whole.diagonal() > 0
-    solve = factorized(whole[used][:, used].tocsc())
+    solve = _solver(whole[used][:, used])
     count = int(hand.max()) + 1
     centres = np.stack([kernels[hand == g].mean(0) for g in range(count)])
     field = np.zeros((3 * grid.size, count, 6))
     for g in range(count):
         loads = body.force @ by_component(rigid_motions(body.places - centres[g]) * (of == g)[:, None, None])
-        field[used, g] = np.stack([solve(load) for load in loads[used].T], -1)
+        field[used, g] = solve(loads[used])
     nodes, values, gradients = grid.splines(points)
     at = field.reshape(3, grid.size, count, 6)[:, nodes]
     moved = np.einsum("pn,apngc->pagc", values, at, optimize=True)
     return centres, moved, np.einsum("pnb,apngc->pabgc", gradients, at, optimize=True)
 
 
+def _solver(k: sp.spmatrix) -> Solver:
+    """Displacements (D, ...) of a body of stiffness k, symmetric and positive, under forces."""
+    symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    return cast(Solver, splu(k.tocsc(), **symmetric).solve)
+
+
 def lowest(
-    k: sp.spmatrix, carry: sp.spmatrix, count: int, rigid: np.ndarray | None = None
+    solve: Solver, carry: sp.spmatrix, count: int, rigid: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Smallest eigenvalues (M,) and vectors (D, M) of k x = value carry^T carry x, with carry x orthonormal.
 
-    The mass carry^T carry has a small rank R, so the R x R matrix of compliances carry k^-1 carry^T is solved instead:
-    its largest eigenvalues are the inverses. Vectors are orthogonal to ``rigid`` motions (D, 6), if there are any:
-    loads are freed of them beforehand, displacements afterwards (inertia relief).
+    ``solve`` gives k^-1 of forces. The mass carry^T carry has a small rank R, so the R x R matrix of compliances
+    carry k^-1 carry^T is solved instead: its largest eigenvalues are the inverses. Vectors are orthogonal to ``rigid``
+    motions (D, 6), if there are any: loads are freed of them beforehand, displacements afterwards (inertia relief).
     """
-    solve = factorized(k.tocsc())
     rank = carry.shape[0]
     count = min(count, rank)
     turned = carry.T.tocsc()
@@ -315,10 +327,10 @@ def lowest(
         return x - whole @ (whole.T @ x)
 
     def comply(x: np.ndarray) -> np.ndarray:
-        return elastic(carry @ solve(turned @ elastic(x.ravel())))
+        return elastic(carry @ solve(turned @ elastic(x)))
 
     if rank <= max(400, 2 * count):
-        compliance = np.stack([comply(row) for row in np.eye(rank)], 1)
+        compliance = comply(np.eye(rank))
         inverse, found = eigh((compliance + compliance.T) / 2)
     else:
         operator = LinearOperator((rank, rank), matvec=comply, dtype=np.float64)
@@ -327,7 +339,7 @@ def lowest(
     inverse, found = inverse[order], found[:, order]
     kept = inverse > 1e-12 * inverse[0]
     inverse, found = inverse[kept], found[:, kept]
-    vectors = np.stack([solve(turned @ v) for v in found.T], 1) / inverse
+    vectors = solve(turned @ found) / inverse
     if rigid is not None:
         vectors -= rigid @ np.linalg.lstsq(carry @ rigid, carry @ vectors, rcond=None)[0]
     return 1 / inverse, vectors
