@@ -196,7 +196,7 @@ def test_a_comparison_is_at_strength_on_sealed_data(monkeypatch: pytest.MonkeyPa
     assert config.protocol.part == "test" and config.trainer.max_minutes == 10
     config = compose("train", ["method=gausim_paper", "protocol=pudding_soft_test", "budget=gpu"])
     assert config.data.repeats == 70 and config.loss.backprop_steps == 1 and config.data.names == ["pudding_soft"]
-    assert config.data.test.seeds == list(range(101, 109)) and str(config.data.root).endswith("synthetic_test")
+    assert config.data.test.seeds == list(range(101, 121)) and str(config.data.root).endswith("synthetic_test")
 
 
 def leaves(node: Any) -> list[Any]:

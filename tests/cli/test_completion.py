@@ -30,7 +30,7 @@ from gausim.cli.main import COMMANDS, main
         ("prepare lpips --f", {"--from"}),
         ("train --mu", {"--multirun"}),
         ("train model=gausim_", {"model=gausim_elastic", "model=gausim_paper"}),
-        ("train mod", {"model=", "model."}),
+        ("train mod", {"model=", "model.", "model_for_data="}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
         ("train model=gausim model.simulator.template.perio", {"model.simulator.template.period="}),
         ("train loss.image.win", {"loss.image.window="}),  # which no configuration lists

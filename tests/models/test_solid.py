@@ -46,6 +46,19 @@ def test_the_inside_of_a_closed_shell_is_body_and_a_sheet_stays_a_sheet() -> Non
     np.testing.assert_array_equal(grids.inside(sheet), sheet)
 
 
+def test_a_grid_is_not_so_fine_that_sparse_kernels_leave_holes() -> None:
+    """The volume of a cube is that of its solid cells; fine ones between its kernels are empty."""
+    rng = np.random.default_rng(0)
+    points, face = rng.uniform(size=(300, 3)), rng.integers(0, 6, 300)
+    points[np.arange(300), face // 2] = face % 2
+    diagonal, volumes = 3**0.5, {}
+    for least in (0.0, 1.7):
+        _, _, weights = grids.cells(points, solid.SolidSettings(0.05, least).size(points, diagonal))
+        volumes[least] = weights[weights == weights.max()].sum()
+    assert volumes[0.0] < 0.5 and volumes[1.7] == pytest.approx(1.0, abs=0.2)
+    assert solid.SolidSettings(0.2, 1.7).size(points, diagonal) == pytest.approx(0.2 * diagonal)
+
+
 def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
     points = _shell((1.0, 0.8, 0.6), 0.1)
     grid, centres, weights = grids.cells(points, 0.2)

@@ -24,7 +24,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.reference.floor import Contact, Elasticity
 from gausim.models.reference.placed import Placed
 from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
-from gausim.models.template.solid import static_responses
+from gausim.models.template.solid import SolidSettings, static_responses
 from gausim.ops.deformation import apply, polar_rotation
 from gausim.ops.rotation import rotation_vector
 
@@ -35,8 +35,8 @@ MOST_POSES = 4096
 class StaticShape:
     """The reference of the units of one scene, as a function of where its hands are; computed once per scene."""
 
-    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, *, spacing: float) -> None:
-        """Computes the static modes; ``spacing`` of their grid is in diagonals."""
+    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, solid: SolidSettings) -> None:
+        """Computes the static modes of a solid body."""
         own, level = scene.means[hierarchy.kernels], hierarchy.levels[finest]
         pinned = scene.pinned[hierarchy.kernels]
         hand = torch.full_like(hierarchy.kernels, -1) if scene.hand is None else scene.hand[hierarchy.kernels]
@@ -51,9 +51,10 @@ class StaticShape:
         if int(self._holder.max()) == 0:  # one hand: the body follows rigidly
             self._centres, self._modes, self._slopes = self._pins.mean(0)[None], None, None
         else:
+            kernels = own.double().numpy()
             arrays = static_responses(
-                own.double().numpy(), held.where(pinned, torch.tensor(-1)).numpy(), level.rest.double().numpy(),
-                spacing=spacing * hierarchy.diagonal,
+                kernels, held.where(pinned, torch.tensor(-1)).numpy(), level.rest.double().numpy(),
+                spacing=solid.size(kernels, hierarchy.diagonal),
             )  # fmt: skip
             self._centres, self._modes, self._slopes = (torch.from_numpy(np.ascontiguousarray(x)) for x in arrays)
         self.at = lru_cache(MOST_POSES)(self._at)

@@ -18,6 +18,7 @@ from gausim.models.reference.floor import Contact, Elasticity
 from gausim.models.reference.free import FreeBody
 from gausim.models.reference.held import HeldBody, StaticShape
 from gausim.models.reference.reference import Body, MovingReference, Reference, StillReference
+from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import PreparedTemplate
 
 # Initial coefficients where they are trained.
@@ -42,14 +43,14 @@ class SceneSurroundings(nn.Module):
             self.friction = nn.Parameter(torch.tensor(math.log(math.expm1(FRICTION))))
         if floor is not None and floor.restitution is None:
             self.restitution = nn.Parameter(torch.logit(torch.tensor(RESTITUTION)))
-        self.spacing = 0.12  # of the grid of the static shape [diagonals]
+        self.solid = SolidSettings()  # of the static shape
         self.moves = not self.facts.still or scene.hand is not None
         self._built_from = scene, hierarchy, finest
 
     @cached_property
     def shape(self) -> StaticShape | None:
         """The static shape of a body in hands or pins; None for a free body."""
-        return None if self.facts.free else StaticShape(*self._built_from, spacing=self.spacing)
+        return None if self.facts.free else StaticShape(*self._built_from, self.solid)
 
     def acceleration(self, dt: float, like: Tensor) -> Float[Tensor, " 3"]:
         """Gravity [scene units / frame^2]."""

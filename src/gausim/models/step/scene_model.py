@@ -24,6 +24,7 @@ from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.modal import ModalScene
 from gausim.models.template.smooth import smooth_motions
+from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import Motion, PreparedScenes, PreparedTemplate, Property, Template
 from gausim.nn.normaliser import normalisers_of
 
@@ -113,10 +114,10 @@ class SceneModel(nn.Module, ABC):
         axes = None if frames is None else frames.axes[-1]
         return reference_of(own, batch, mass, replace(units, rest=rest), template, axes, driven=driven)
 
-    def resolve_shapes(self, spacing: float) -> None:
-        """Has static shapes of bodies in hands computed on grids of this spacing [diagonals]."""
+    def shape_bodies(self, solid: SolidSettings) -> None:
+        """Says of which solids the static shapes of bodies in hands are."""
         for own in self.surroundings:
-            cast(SceneSurroundings, own).spacing = spacing
+            cast(SceneSurroundings, own).solid = solid
 
     def frames(self, batch: SceneBatch) -> Frames | None:
         """Body axes for every unit of a batch; None where scene axes are used."""

@@ -88,7 +88,7 @@ class GausSim(SceneModel):
             self.hierarchies, self.predicted_levels[-1], attributes=features.attributes, frames=self.body_axes,
             conserve_volume=conserve_mass,
         )  # fmt: skip
-        self.resolve_shapes(self.template.spacing)
+        self.shape_bodies(self.template.solid)
         self.predictor = DeformationPredictor(
             networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features.of(scenes),
             network=network, head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,

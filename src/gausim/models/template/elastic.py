@@ -59,7 +59,7 @@ class ElasticScene(nn.Module):
         kernels, held, solid = finer.rest.double().numpy(), finer.pinned.numpy(), SolidSettings.of(solid)
         body = solid_body(
             kernels, held, rest, mass, pinned,
-            modes=modes, spacing=solid.spacing * hierarchy.diagonal, inside=solid.held_inside,
+            modes=modes, spacing=solid.size(kernels, hierarchy.diagonal), inside=solid.held_inside,
         )  # fmt: skip
         values, phi, slopes, strains = body.of_units(rest, pinned)
         count = phi.shape[-1]

@@ -111,7 +111,7 @@ class BodyModes(nn.Module):
         mass = level.volume.double().numpy()
         mass = mass / mass[~pinned].mean()
         own = kernels.rest.double().numpy() @ frame.T
-        size = solid.spacing * hierarchy.diagonal
+        size = solid.size(own, hierarchy.diagonal)
         body = solid_body(
             own, kernels.pinned.numpy(), rest, mass, pinned,
             modes=modes, spacing=size, inside=solid.held_inside, curved=CURVED if finite else 0,
@@ -225,9 +225,8 @@ class MaterialTemplate(Template):
             )
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
-        body = SolidSettings.of(solid)
-        self.spacing = body.spacing
-        made = partial(BodyModes, finest=finest, solid=body, links=self.links.neighbours, finite=finite_strain)
+        self.solid = SolidSettings.of(solid)
+        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=finite_strain)
         counts = [modes * (1 if h.levels[0].pinned.any() else free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
             made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)

@@ -39,12 +39,18 @@ class SolidSettings:
     """How the body around the kernels is modelled; a number in the place of these stands for ``spacing``."""
 
     spacing: float = 0.12  # of the grid [diagonals]
+    least: float = 0.0  # the grid's least spacing, in median distances of a kernel to its fourth neighbour
     held_inside: bool = False  # pinned kernels hold what is within the body beside them, too; not in earlier runs
 
     @classmethod
     def of(cls, solid: SolidSettings | float) -> SolidSettings:
         """The settings that a number stands for."""
         return solid if isinstance(solid, SolidSettings) else cls(solid)
+
+    def size(self, kernels: np.ndarray, diagonal: float) -> float:
+        """Spacing of the grid of a body [scene units]: where kernels (K, 3) are sparse, a fine one has holes."""
+        apart = cKDTree(kernels).query(kernels, k=min(5, len(kernels)))[0][:, -1] if self.least else np.zeros(1)
+        return max(self.spacing * diagonal, self.least * float(np.median(apart)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.modal import ModalScene
+from gausim.models.template.solid import SolidSettings
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
@@ -115,11 +116,11 @@ class Template(nn.Module, ABC):
         has_energy: whether the result of :meth:`prepare` has an energy, as that of :class:`PreparedScenes`.
         headroom: factor on the initial energy of a rollout, the energy guard's limit in its first frames.
         is_shared: whether the parameters are common to all scenes, like the network's, or separate per scene.
-        spacing: of the grid on which the static shape of a body in hands is computed [diagonals].
+        solid: the body whose static shape is the reference of a body in hands.
     """
 
     has_energy, is_shared = False, False
-    headroom, spacing = 1.0, 0.12
+    headroom, solid = 1.0, SolidSettings()
 
     @abstractmethod
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
