@@ -87,10 +87,13 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path) ->
         silence(module.model)  # what is left is the template's
         return [*found, determinants([step_of(module).deformation_gradients])]
 
-    for kept, freed in (("none", "no_mass"), ("no_hierarchy", "[no_mass,no_hierarchy]")):
-        conserved, free = of(kept), of(freed)
-        assert max(conserved) < 1e-4, (kept, conserved)
-        assert all(b > 100 * max(a, 1e-5) for a, b in zip(conserved, free, strict=True)), (freed, free)
+    # Free is a hundred times what conservation leaves.
+    *found, template = of("no_mass")
+    assert max(of("none")) < 1e-4 and min(found) > 0.01 and template > 1e-3, (found, template)
+    # Single kernels are corrected little, and conservation leaves less of it, so here it is a thousand times.
+    conserved, free = of("no_hierarchy"), of("[no_mass,no_hierarchy]")
+    assert max(conserved) < 1e-4, conserved
+    assert all(b > 1000 * max(a, 1e-6) for a, b in zip(conserved, free, strict=True)), (conserved, free)
 
 
 def test_no_momentum_computes_no_such_loss(toy: Path) -> None:
