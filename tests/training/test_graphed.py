@@ -10,7 +10,9 @@ import torch
 from helpers.meta_device import asking_nothing
 from helpers.sway import ELASTIC, blobs, real_module, sample
 from torch import Tensor, nn
+from torch.profiler import ProfilerActivity, profile
 
+from gausim.kernels.operations import plain_forms
 from gausim.losses.objective import EnergyLoss, Objective
 from gausim.models.settings import RolloutSettings
 from gausim.models.template.material import MaterialTemplate
@@ -80,6 +82,21 @@ def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(monkeypatch: pyt
         trained = [*given, *(p for p in model.parameters() if p.requires_grad)]
         found = torch.autograd.grad(made, trained, [torch.empty_like(x) for x in made], allow_unused=True)
     assert sum(gradient is not None for gradient in found) > len(trained) / 2
+
+
+@TEMPLATES
+def test_no_operation_of_a_backward_pass_reads_a_number(template: Any) -> None:
+    """Of those within ATen, too, which tensors without values pass by: the gradient of a trace is one."""
+    model = module_on("cpu", template=template, edges="rest").simulator
+    batch = model.batch((0, 0))
+    stretch, given = _Stretch(model, batch, 2), [batch.rest.clone().requires_grad_() for _ in range(2)]
+    trained = [*given, *(p for p in model.parameters() if p.requires_grad)]
+    stretch(*given)  # what a batch keeps from its first use on
+    with plain_forms(), profile(activities=[ProfilerActivity.CPU]) as seen:
+        made = [x for x in stretch(*given) if x.requires_grad]
+        torch.autograd.grad(made, trained, [torch.ones_like(x) for x in made], allow_unused=True)
+    read = [event.cpu_parent.cpu_parent for event in seen.events() if event.name == "aten::_local_scalar_dense"]
+    assert {parent.name for parent in read} <= {"aten::linalg_lu_solve"}  # which checks its pivots on the CPU only
 
 
 def test_only_rollouts_of_fixed_shape_are_captured_and_only_on_a_device() -> None:

@@ -279,7 +279,7 @@ class MaterialTemplate(Template):
         loss = sum(lost.index_select(0, end) for end in body.springs.ends)[:, None, None]  # twice a link's mean
         dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
         dragged = dragged + body.between.flatten(0, 1).mT @ (loss * tied).flatten(0, 1)
-        rate = dragged.trace() / inertia.trace()
+        rate = _trace(dragged) / _trace(inertia)
         mass = inertia
         if body.cells is not None:
             slowed = ((k * stiffness).diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
@@ -344,6 +344,11 @@ class MaterialTemplate(Template):
         return self.body(scene_id).vibrations
 
 
+def _trace(matrix: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
+    """The trace. The backward pass of torch's own waits for the device, which a CUDA graph cannot."""
+    return matrix.diagonal().sum()
+
+
 def _saturated(logarithms: Tensor) -> Tensor:
     return LARGEST_LOG * torch.tanh(logarithms / LARGEST_LOG)
 
@@ -385,7 +390,7 @@ class PreparedMaterial(ModalScene):
         is reduced as the trapezoidal rule reduces their pull.
         """
         reference = self.reference * self.values.sum()
-        pace = self.matrices.stiffness.trace() / self.mass.trace() * len(self.values) / reference
+        pace = _trace(self.matrices.stiffness) / _trace(self.mass) * len(self.values) / reference
         return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
