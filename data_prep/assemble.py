@@ -178,5 +178,5 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about the object, for people."""
     lines = described(results["facts"], results["stills"], results["sequences"])
     if results["scene"]:
-        return "\n".join([*lines, f"train       {train_command(results['facts'], out)}"])
+        return "\n".join([*lines, f"train       {train_command(results['facts']['name'], out)}"])
     return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])

@@ -264,5 +264,5 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     if results["without_alpha"]:
         lines.append(f"no alpha    in {', '.join(results['without_alpha'])}: segment {out} next")
     else:
-        lines.append(f"next        {train_command(facts, out)}")
+        lines.append(f"next        {train_command(facts['name'], out)}")
     return "\n".join(lines)

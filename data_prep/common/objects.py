@@ -9,8 +9,6 @@ from typing import Any
 from gausim.core.errors import DataError
 
 MOST_FAULTS = 5
-# Predicted steps that training ends with unless it is told otherwise (conf/data/object.yaml).
-CURRICULUM = 15
 
 
 def object_facts(
@@ -40,11 +38,9 @@ def described(facts: Mapping[str, Any], stills: int, sequences: Mapping[str, int
     ]
 
 
-def train_command(facts: Mapping[str, Any], out: Path) -> str:
-    """The command that trains on an object; a curriculum longer than its frames would be refused."""
-    steps = facts["train_frames"][1] - 1
-    shorter = f" data.curriculum.t_max={steps}" if steps < CURRICULUM else ""
-    return f"gausim train data=object data.root={out}{shorter} name={facts['name']}"
+def train_command(name: str, out: Path) -> str:
+    """The command that trains on an object."""
+    return f"gausim train data=object data.root={out} name={name}"
 
 
 def refuse_faults(work: Path, out: Path) -> None:

@@ -103,4 +103,4 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     lines += [f"{key:<11} {value}" for key, value in results.get("notes", {}).items()]
     start = f" --points {out / POINTS}" if results["points"] else ""
     lines.append(f"next        gausim reconstruct {out}{start}")
-    return "\n".join([*lines, f"then        {train_command(facts, out)}"])
+    return "\n".join([*lines, f"then        {train_command(facts['name'], out)}"])

@@ -42,6 +42,26 @@ def test_curriculum_grows_to_its_cap() -> None:
             Curriculum(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("frames", "largest", "first"), [(3, 2, [2, 2]), (16, 15, [2, 3, 4]), (42, 41, [2, 5, 8]), (200, 60, [2, 7])]
+)
+def test_a_curriculum_without_a_cap_follows_the_seen_frames(frames: int, largest: int, first: list[int]) -> None:
+    curriculum = Curriculum(t_start=2, t_max=0)
+    curriculum.see(frames)
+    assert (
+        curriculum.t_max == largest == curriculum.steps(13)
+        and [curriculum.steps(e) for e in range(len(first))] == first
+    )
+    curriculum.see(5)
+    assert curriculum.t_max == largest
+
+
+def test_the_curriculum_of_a_data_set_follows_its_seen_frames(blob: Path) -> None:
+    data = ReadyDataModule(blob, curriculum=Curriculum(t_max=0))
+    data.setup("fit")
+    assert data.curriculum.t_max == 15
+
+
 def test_training_cannot_hand_out_unseen_frames_and_heldout_views(blob: Path) -> None:
     index = SequenceIndex([ObjectData(blob)])
     sample = index[SampleKey(1, 15)]

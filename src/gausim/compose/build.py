@@ -70,7 +70,7 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         smooth, learns = model.smooth_motions, objective
     else:
         given |= {"scene_of_sequence": [scene_id for scene_id, _ in datamodule.index.entries]}
-        fitted = instantiate(config.model.method, **given, seen=int(config.data.curriculum.t_max))()
+        fitted = instantiate(config.model.method, **given, seen=datamodule.curriculum.t_max)()
         method = StagedFit(fitted, plan, datamodule.curriculum, objective.explosion)
         smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
     sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image, method.references)

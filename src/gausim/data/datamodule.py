@@ -88,12 +88,12 @@ class ReadyDataModule(LightningDataModule):
         have = [item.name for item in found]
         if not found or len(set(have)) != len(have):
             raise ConfigError(f"data.root: expected at least one object, each name once, got {have}.")
-        if self._names is None:
-            return found
-        absent = [name for name in self._names if name not in have]
-        if absent or not self._names:
-            raise ConfigError(f"data.names: {list(self._names)} asked for, the roots hold {have}.")
-        return [item for item in found if item.name in self._names]
+        absent = [name for name in self._names or () if name not in have]
+        if absent or self._names == []:
+            raise ConfigError(f"data.names: {list(self._names or ())} asked for, the roots hold {have}.")
+        chosen = [item for item in found if self._names is None or item.name in self._names]
+        self.curriculum.see(min(len(item.train_frames) for item in chosen))
+        return chosen
 
     @cached_property
     def index(self) -> SequenceIndex:

@@ -146,7 +146,7 @@ def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
             "warning", "likely" if seen < _FEWEST_SEEN else "possible",
             f"Training sees {seen} frames of each sequence only (field 'train_frames' of dataset.json); the paper sees "
             f"{_SEEN}. Less than a swing says little about stiffness and damping.",
-            f"Record longer sequences, or set 'train_frames' to [0, {_SEEN}]; `data.curriculum.t_max` must stay below.",
+            f"Record longer sequences, or set 'train_frames' to [0, {_SEEN}].",
             {"frames": seen},
         )  # fmt: skip
 

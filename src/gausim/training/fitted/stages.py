@@ -142,6 +142,11 @@ class StagedCurriculum(Curriculum):
         """Position in the plan at the beginning of the current epoch [epochs of the plan]."""
         return self._state["position"]
 
+    def see(self, frames: int) -> None:
+        """As for training; T follows."""
+        super().see(frames)
+        self.enter(self.position)
+
     def enter(self, position: float) -> None:
         """Sets stage and T of the next epoch."""
         steps = self.t_max
