@@ -17,7 +17,8 @@ from gausim.evaluation.stability import _LinearStep, largest_eigenvalue
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.rollout.dynamics import scene_dynamics
-from gausim.models.template.material import CURVED, Links, MaterialTemplate, PreparedMaterial
+from gausim.models.template.body_modes import CURVED
+from gausim.models.template.material import Links, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
 

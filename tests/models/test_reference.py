@@ -122,7 +122,7 @@ def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
 
 def test_a_free_body_may_have_more_modes_than_a_held_one() -> None:
     held = replace(_block(), pinned=torch.arange(220) < 20)
-    template = partial(NEURAL["template"], free_modes=2)
+    template = partial(NEURAL["template"], solid=SolidSettings(0.2, held_inside=True, free_modes=2))
     model = make_model([_block(free=True), held], **(NEURAL | {"template": template}))
     assert [model.modal_projection(i).shape[-1] for i in (0, 1)] == [18, 9]
 

@@ -41,8 +41,11 @@ GONE = {
     "TrainerSettings": ("overwrite",),
     "TrackSupervision": ("rate",),
 }
-# New settings of old ones by class: old name, new name, and what makes the new value.
-CHANGED: dict[str, tuple[str, str, Callable[[Any], Any]]] = {"ModalInitialStates": ("modes", "vibrations", bool)}
+# New settings of old ones by class: old name, new name (in a group, after a dot), and what makes the new value.
+CHANGED: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
+    "ModalInitialStates": ("modes", "vibrations", bool),
+    "MaterialTemplate": ("free_modes", "solid.free_modes", int),
+}
 # No schedule now means a constant rate; a run with the cosine schedule can be evaluated, but not resumed.
 SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 # Removed settings of which one value is still supported; a false value stands for all false values.
@@ -135,7 +138,8 @@ def with_present_names(config: Any) -> Any:
             raise ValueError(f"{wanted[0]} is {config[wanted[0]]!r}, which is no longer supported: train the run again")
         if name in CHANGED and CHANGED[name][0] in config:
             old, new, made = CHANGED[name]
-            config = {**config, new: made(config[old])}
+            (group, _, key), value = new.rpartition("."), made(config[old])
+            config = {**config, **({group: {**config[group], key: value}} if group else {key: value})}
             del config[old]
         gone = (*GONE.get(name, ()), *unsupported)
         found = {

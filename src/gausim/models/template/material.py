@@ -47,21 +47,16 @@ from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.finite_strain import FiniteStrain
+from gausim.models.template.body_modes import BodyModes
 from gausim.models.template.modal import ModalScene, force_of_strain
-from gausim.models.template.solid import SolidSettings, solid_body
-from gausim.models.template.springs import Springs, neighbour_pairs
+from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import DENSITY, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
 
 # Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
-# Lowest modes of which derivatives are among the modes of a body with finite strain: 21 of 48.
-CURVED = 6
 # Largest angular frequency of a mode of a body with finite strain: two swings a frame [1 / frame].
 FASTEST = 4 * math.pi
-# Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
-AMPLITUDE = 0.05
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
 # as a body's periods are wrong, strong damping fits best, and training is slow to reduce it again.
 GAIN, DAMPING_GAIN = 10.0, 0.5
@@ -74,86 +69,9 @@ class Links:
     """Links between neighbouring units."""
 
     neighbours: int = 12  # of a unit
-    linear: float = 0.3  # initial stiffness and inertia of all links over the body's (see :class:`BodyModes`)
+    linear: float = 0.3  # initial stiffness and inertia of all links over the body's
     springs: float = 0.15  # the same for the stiffness of links e^{g_ij}; its linear part is in K
     damping: float = 0.0  # resistance to the growth of length or strain over that to it [frames at 24 per second]
-
-
-class BodyModes(nn.Module):
-    """Constants of one scene's geometry in modal coordinates; without trained parameters.
-
-    All links together are as stiff as the body: in the sum over the modes, or, with finite strain, in their mean. The
-    derivatives among the modes are so stiff that nothing else would count in a sum.
-    """
-
-    modes: Tensor  # Phi (N, 3, M), orthonormal under the units' volumes
-    gradients: Tensor  # displacement gradients of the modes (N, 3, 3, M) [1 / scene units]
-    projection: Tensor  # (N, 3, M), z = sum_n projection_n u_n
-    values: Tensor  # eigenvalues of the homogeneous body (M,), the first is 1
-    stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M); their sum is that of the homogeneous body
-    strain: Tensor  # strain of the modes in the cells near each unit, row by row, times volume (N, 9, M)
-    inertia: Tensor  # root of M_i, (N, 3, M)
-    stretch: Tensor  # root of S_ij, (E, M)
-    between: Tensor  # root of T_ij, (E, 3, M)
-    distance: Tensor  # logarithm of the links' lengths over their mean (E,)
-    springs: Springs  # the links as springs, with stiffness per unit of S_ij
-    cells: FiniteStrain | None  # of the homogeneous body, if its strain is finite
-
-    def __init__(
-        self,
-        hierarchy: Hierarchy, finest: int, frame: np.ndarray, *,
-        modes: int, solid: SolidSettings, links: int, finite: bool,
-    ) -> None:  # fmt: skip
-        """Computes the constants in the axes ``frame`` (3, 3) of the body; see :class:`MaterialTemplate`."""
-        super().__init__()
-        level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
-        rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
-        mass = level.volume.double().numpy()
-        mass = mass / mass[~pinned].mean()
-        own = kernels.rest.double().numpy() @ frame.T
-        size = solid.size(own, hierarchy.diagonal)
-        body = solid_body(
-            own, kernels.pinned.numpy(), rest, mass, pinned,
-            modes=modes, spacing=size, inside=solid.held_inside, curved=CURVED if finite else 0,
-        )  # fmt: skip
-        phi, slope = body.at(rest)
-        phi[pinned], slope[pinned] = 0, 0
-        lowest = body.values[0]
-        pairs = _links(rest, pinned, links)
-        change = phi[pairs[1]] - phi[pairs[0]]
-        offset = rest[pairs[1]] - rest[pairs[0]]
-        length = np.linalg.norm(offset, axis=1)
-        stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
-        values = np.maximum(body.values, 1e-6 * body.values[-1]) / lowest
-        weight = 1 / values if finite else np.ones_like(values)
-        even = math.sqrt((weight * body.values).sum() / lowest / max(float((weight * stretch**2).sum()), 1e-30))
-        # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
-        self.tie = math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
-        arrays = {
-            "modes": phi,
-            "gradients": slope,
-            "projection": phi * mass[:, None, None],
-            "values": values,
-            "stiffness": body.cell_stiffness(rest, pinned) / lowest,
-            "strain": body.strains(rest),
-            "inertia": phi * np.sqrt(mass)[:, None, None],
-            "stretch": even * stretch,
-            "between": self.tie * change,
-            "distance": np.log(length / length.mean()),
-        }
-        for name, array in arrays.items():
-            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
-        self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
-        self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
-        self.vibrations = body.vibrations
-        self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
-
-
-def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
-    """Pairs (2, E) of neighbouring units at non-zero distance, at least one of them free."""
-    pairs = neighbour_pairs(rest, count)
-    distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
-    return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +106,6 @@ class MaterialTemplate(Template):
         attributes: int,
         frames: Sequence[np.ndarray],
         modes: int = 48,
-        free_modes: int = 1,
         solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
         finite_strain: bool = False,
@@ -205,8 +122,6 @@ class MaterialTemplate(Template):
             attributes: number of attributes per unit.
             frames: axes (3, 3) of each scene in which the template works.
             modes: number of modes.
-            free_modes: how many times as many modes a body has that nothing holds. An impact deforms it where it
-                touches the floor, which takes more modes than to swing about a hold.
             solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
             finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
@@ -227,7 +142,7 @@ class MaterialTemplate(Template):
         self.links = Links(links) if isinstance(links, int) else links
         self.solid = SolidSettings.of(solid)
         made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=finite_strain)
-        counts = [modes * (1 if h.levels[0].pinned.any() else free_modes) for h in hierarchies]
+        counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
             made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )

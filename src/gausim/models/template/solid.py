@@ -41,6 +41,7 @@ class SolidSettings:
     spacing: float = 0.12  # of the grid [diagonals]
     least: float = 0.0  # the grid's least spacing, in median distances of a kernel to its fourth neighbour
     held_inside: bool = False  # pinned kernels hold what is within the body beside them, too; not in earlier runs
+    free_modes: int = 1  # times as many modes for a body that nothing holds: an impact deforms it where it touches
 
     @classmethod
     def of(cls, solid: SolidSettings | float) -> SolidSettings:
