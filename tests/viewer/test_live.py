@@ -1,0 +1,195 @@
+"""The viewer's simulating thread: what is done to it, played back, undone and stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="the extra 'view' is not installed")
+
+
+from gausim.core import ConfigError
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
+from gausim.interaction.selections import Ball, Unit, Whole
+from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
+from gausim.viewer.companion import Companion
+from gausim.viewer.live import Live
+from gausim.viewer.pointer import Pointer
+from gausim.viewer.shown import LIVE, Shown, Take
+from gausim.viewer.splats import SIZE, Placing
+
+
+@pytest.fixture
+def live(make_interaction: Callable[..., Interaction]) -> tuple[Live, list[Shown]]:
+    shown: list[Shown] = []
+    return Live(make_interaction(keep=None), shown.append), shown
+
+
+def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    interaction = one.interaction
+    scene, placing = interaction.scene, Placing.of(interaction.scene)
+    pointer = Pointer(MagicMock(), one, placing, interaction.units, interaction.masses)
+    pointer.follow(one.shown())
+    followed: list[tuple[float, float, float]] = []
+    pointer.hand_moved = lambda hand, to: followed.append(to)
+
+    def drag(kernel: int, *way: tuple[str, tuple[float, float, float]], handle: int = 0) -> None:
+        begun = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
+        for phase, moved in way:
+            start = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
+            camera = SimpleNamespace(position=start - np.array([0.0, 0.0, SIZE]))  # looks up from below
+            end = begun + placing.scale * np.array(moved)
+            asyncio.run(
+                pointer._dragged(
+                    SimpleNamespace(
+                        client=SimpleNamespace(camera=camera), client_id=0, phase=phase, instance_index=handle,
+                        start_position=start, end_position=end,
+                    )
+                )
+            )  # fmt: skip
+            one._take_commands(0.0)
+            one.advance()
+
+    low = int(scene.means[:, 2].masked_fill(~scene.pinned, torch.inf).argmin())
+    drag(low, ("start", (0.0, 0.0, 0.0)), ("update", (0.1, 0.0, 0.0)), ("end", (0.1, 0.0, 0.0)))
+    for _ in range(6):
+        one.advance()
+    assert not one.message and not interaction.acting
+    moved = interaction.frame.positions - scene.means
+    torch.testing.assert_close(moved[scene.pinned], torch.tensor([0.1, 0.0, 0.0]).expand(int(scene.pinned.sum()), 3))
+    assert followed and followed[-1] == pytest.approx((0.1, 0.0, 0.0), abs=1e-5)
+    free = int(scene.means[:, 2].argmax())  # a pin's own handle moves its hand, whatever is in front
+    pins = len(pointer._centres(scene.means)) - 1
+    drag(free, ("start", (0.0, 0.0, 0.0)), ("update", (0.0, 0.1, 0.0)), ("end", (0.0, 0.1, 0.0)), handle=pins)
+    assert interaction.session().entries[-1].event.to == pytest.approx((0.1, 0.1, 0.0), abs=1e-5)  # goes on from there
+
+
+def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    for number in range(12):
+        if number == 2:
+            one.act(Force(Unit(1, 3), (1.0, 0, 0), 2.0, name="drag-0"))
+        if number == 5:
+            one.act(Release("drag-0"))
+            one.act(Wind((0.0, 1.0, 0.0), 0.5, gusts=0.5))
+        if number == 8:
+            one.act(Pin(Unit(1, 0)))
+            one.act(Impulse(Whole(), (0.0, 0.0, 1.0), 0.05))
+        one.advance()
+    recorded, session = one.interaction.trajectory(), one.interaction.session()
+    one.replay(session)
+    with pytest.raises(ConfigError, match="played back"):
+        one.act(Reset())
+    while one.playing:
+        one.advance()
+    assert "over" in one.message
+    again = one.interaction.trajectory()
+    assert torch.equal(again.positions, recorded.positions) and torch.equal(
+        again.deformation_gradients, recorded.deformation_gradients
+    )
+    assert one.interaction.session() == session
+    assert torch.equal(replay(one.interaction, session).positions, recorded.positions)
+
+
+def test_the_timeline_goes_back_and_play_goes_on_from_the_end(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    one.act(Gravity((1.0, 0.0, 0.0), 1.0))
+    for _ in range(6):
+        one.advance()
+    last = one.interaction.frame.positions
+    one.scrub(2)
+    assert not one.playing and one.shown().number == 2 and one.shown().last == 6
+    assert not torch.equal(one.shown().frame.positions, last)
+    one.play()
+    assert torch.equal(one.shown().frame.positions, last)
+    one.reset()
+    assert one.shown().last == 0 and torch.equal(one.shown().frame.positions, one.interaction.scene.means)
+    for wrong in (-5, 10**6):
+        one.scrub(wrong)
+        assert one.shown().number == 0
+
+
+def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(
+    make_interaction: Callable[..., Interaction],
+) -> None:
+    shown: list[Shown] = []
+    one = Live(make_interaction(farthest=1e-4), shown.append)
+    one.act(Gravity((1.0, 0.0, 0.0), 2.0))
+    one.start()
+    while one.playing:
+        time.sleep(0.01)
+    assert "stopped" in one.message and "kernel" in one.message
+    one.do(one.play)
+    time.sleep(0.2)
+    assert one.is_alive() and not one.playing
+    one.do(one.reset)
+    while one.message:
+        time.sleep(0.01)
+    one.do(one.play)
+    while one.interaction.frame_number < 3:
+        time.sleep(0.01)
+    assert one.interaction.broken is None
+    one.stop()
+    one.join(5)
+
+
+def test_too_many_commands_let_everything_go(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    one.act(Force(Whole(), (1.0, 0, 0), 1.0))
+    for _ in range(5000):
+        one.do(lambda: None)
+    assert one._commands.qsize() <= 1024
+    one._take_commands(0.0)
+    assert not one.interaction.acting and "let go" in one.message
+
+
+def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interaction]) -> None:
+    watched = threading.Event()
+    one = Live(make_interaction(), lambda _: None, watched=watched.is_set)
+    one.start()
+    time.sleep(0.4)
+    assert one.interaction.tick == 0
+    watched.set()
+    while one.interaction.tick < 2:
+        time.sleep(0.01)
+    one.stop()
+    one.join(5)
+
+
+def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interaction: Callable[..., Interaction]) -> None:
+    interaction = make_interaction()
+    trajectory = make_interaction()._dynamics.rollout(interaction.state, 5)
+    one = Live(interaction, lambda _: None, takes=[Take("Predicted: a", lambda: trajectory, "a")])
+    one.choose("Predicted: a")
+    with pytest.raises(ConfigError, match=LIVE):
+        one.act(Reset())
+    for number in range(1, 8):
+        one.advance()
+        assert one.shown().number == number % 6 and one.shown().last == 5
+    assert interaction.tick == 0
+
+
+def test_a_companion_feels_the_same(make_interaction: Callable[..., Interaction]) -> None:
+    leader, follower = make_interaction(), make_interaction()
+    other = Companion("the same again", follower)
+    one = Live(leader, lambda _: None, companion=other)
+    for event in (Force(Unit(2, 0), (1.0, 0, 0), 1.0), Impulse(Ball((0.3, 0.3, 1.0), 0.3), (0.0, 1.0, 0.0), 0.05)):
+        one.act(event)
+        for _ in range(3):
+            one.advance()
+    assert torch.equal(leader.frame.positions, follower.frame.positions)
+    assert float((leader.frame.positions - leader.scene.means).abs().max()) > 0
+    beside = one.shown().beside
+    assert beside is not None and torch.equal(beside.frame.positions, follower.frame.positions)
+    one.reset()
+    assert torch.equal(follower.frame.positions, follower.scene.means)
