@@ -59,7 +59,9 @@ def test_a_curriculum_without_a_cap_follows_the_seen_frames(frames: int, largest
 def test_the_curriculum_of_a_data_set_follows_its_seen_frames(blob: Path) -> None:
     data = ReadyDataModule(blob, curriculum=Curriculum(t_max=0))
     data.setup("fit")
-    assert data.curriculum.t_max == 15
+    assert data.curriculum.t_max == 15 and len(data.introduction()) == len(data.objects)
+    fewer = ReadyDataModule(blob, curriculum=Curriculum(t_max=9))
+    assert "frames 10..15 are seen, but not trained on (data.curriculum.t_max=9)" in fewer.introduction()[1]
 
 
 def test_training_cannot_hand_out_unseen_frames_and_heldout_views(blob: Path) -> None:

@@ -122,14 +122,19 @@ class ReadyDataModule(LightningDataModule):
         return range(len(self.objects))
 
     def introduction(self) -> list[str]:
-        """One line per object."""
-        lines = []
+        """A line per object, and one about what of it is not trained on."""
+        lines, first = [], self.curriculum.t_max + 1
         for item in self.objects:
             cameras = item.sequences[0].cameras
             lines.append(
                 f"{item.name}: {len(item.sequences)} sequences, {len(item.train_views)} views of "
                 f"{cameras.width}x{cameras.height}, {item.fps:g} fps"
             )
+            if first < item.train_frames.stop:
+                lines.append(
+                    f"{item.name}: frames {first}..{item.train_frames.stop - 1} are seen, but not trained on "
+                    f"(data.curriculum.t_max={first - 1})"
+                )
             sealed = [record.name for record in item.sequences if record.limit is not None]
             if sealed:
                 lines.append(
