@@ -168,7 +168,7 @@ def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous
     matrices = template.matrices(0, *(0.0 * x for x in _material(hierarchy)), 1 / 24)
     assert not matrices.uneven.any()
     uneven = torch.tensor([0.7, 0.2]).double().expand(len(rest), 2)
-    part = PreparedMaterial(template.body(0), replace(matrices, uneven=uneven, tense=0 * matrices.tense), None)
+    part = PreparedMaterial(template.body(0), replace(matrices, uneven=uneven, tense=0 * matrices.tense), 1.0)
     load = torch.cat((torch.zeros(3), even.flatten())).double().expand(1, len(rest), 12)
     torch.testing.assert_close(part.force(load)[0], expected, atol=1e-5, rtol=1e-4)
 

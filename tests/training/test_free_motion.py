@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import sway
-from torch import Tensor
+from torch import Tensor, nn
 
 from gausim.core import ConfigError, SimState
 from gausim.losses.objective import EnergyLoss, Objective
@@ -21,12 +21,13 @@ from gausim.training.terms.free_motion import energy_growth
 sample, sway_module, ELASTIC = sway.sample, sway.sway_module, sway.ELASTIC
 
 
-class Spiral:
+class Spiral(nn.Module):
     """Two members whose distance from rest grows by a factor per frame, each by its own."""
 
     knows_energy = True
 
     def __init__(self, factor: Tensor) -> None:
+        super().__init__()
         self.factor, self.batch_of = factor, SimpleNamespace(rest=torch.arange(12.0).view(4, 3), members=(0, 1))
         self.scenes, self.sizes = (), []
 

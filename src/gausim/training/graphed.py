@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, cast
 
 import torch
@@ -43,7 +43,9 @@ class GraphedRollouts:
     def __init__(self, model: nn.Module) -> None:
         """Starts without a capture."""
         self._model = model
-        self._kept: dict[object, tuple[object, nn.Module]] = {}  # what it holds for, and the capture
+        self._kept: dict[
+            object, tuple[object, Callable[..., tuple[Tensor, ...]]]
+        ] = {}  # what it holds for, and the capture
 
     @property
     def serves(self) -> bool:
@@ -85,7 +87,7 @@ class GraphedRollouts:
         made = [x.clone() for x in self._kept[kind][1](*given)]  # the next replay overwrites what the capture returns
         return [Frame(*own) for own in zip(*made, strict=True)]
 
-    def _capture(self, stretch: _Stretch, initial: SimState) -> nn.Module:
+    def _capture(self, stretch: _Stretch, initial: SimState) -> Callable[..., tuple[Tensor, ...]]:
         given = tuple(x.detach().clone().requires_grad_(x.requires_grad) for x in (initial.positions, initial.previous))
         kept = [buffer.clone() for buffer in self._model.buffers()]  # rollouts before the capture are not to count
         gc.collect()  # during a capture no earlier one may be freed
@@ -100,4 +102,4 @@ class GraphedRollouts:
         with torch.no_grad():
             for buffer, value in zip(self._model.buffers(), kept, strict=True):
                 buffer.copy_(value)
-        return cast(nn.Module, made)
+        return cast(Callable[..., tuple[Tensor, ...]], made)
