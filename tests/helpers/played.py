@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import torch
 
+from gausim.compose.build import LoadedRun
 from gausim.data.objects import ObjectData
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -17,20 +18,22 @@ from helpers import toy_object
 from helpers.simulators import gausim
 
 
-def stand_in(directory: Path, root: Path, *, model: object, **parts: object) -> SimpleNamespace:
+def stand_in(directory: Path, root: Path, *, model: object, **parts: object) -> LoadedRun:
     """What loading a finished run gives, with a model and parts of a module of our own."""
     directory.mkdir(parents=True)
     torch.save({"state_dict": {}, "gausim": {}, "epoch": 3, "global_step": 40}, directory / "last.ckpt")
     (directory / "FINISHED").write_text("{}")
     (directory / "config.yaml").write_text("name: toy\n")
     facts = {"method_name": "gausim", "footnotes": None, "method": None}
-    return SimpleNamespace(
+    run = object.__new__(LoadedRun)  # without its checks of types, which parts of our own would not pass
+    vars(run).update(
         config={"name": "toy", "seed": 5, "model": {"modes": 6}}, run_dir=directory, objects=[ObjectData(root)],
         module=SimpleNamespace(model=model, simulator=model, **facts, **parts), renderer=ReferenceRenderer(),
     )  # fmt: skip
+    return run
 
 
-def played_run(folder: Path) -> SimpleNamespace:
+def played_run(folder: Path) -> LoadedRun:
     """Two sequences of one object; the network has random weights, the template a firm block."""
     toy = toy_object.write_toy_object(folder / "data" / "toy")
     torch.manual_seed(0)
