@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 from helpers import public_sets
 from helpers.public_sets import FRAMES, SEEN, Sample
 
 from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
+from data_prep.common.objects import train_command
 from data_prep.import_3dgsim import GenesisOptions
 from data_prep.import_pacnerf import PacNerfOptions
 from data_prep.import_physdreamer import PhysDreamerOptions
@@ -248,6 +250,13 @@ def test_a_body_that_turns_onto_itself_is_ambiguous(tmp_path: Path, monkeypatch:
     options = SpringGausOptions(object="bun", turns=150, least_overlap=0)
     made = import_springgaus.import_springgaus(sample.root, tmp_path / "out", options)["results"]["objects"]["bun"]
     assert made["notes"]["look at"].startswith("another turn")
+
+
+def test_the_command_that_trains_fits_the_frames() -> None:
+    """By its default, which follows the seen frames."""
+    with (Path(__file__).parents[2] / "conf" / "data" / "object.yaml").open() as file:
+        assert yaml.safe_load(file)["curriculum"]["t_max"] == 0
+    assert train_command("duck", Path("out")) == "gausim train data=object data.root=out name=duck"
 
 
 def test_two_sequences_of_one_name_are_refused(real: Sample, tmp_path: Path) -> None:

@@ -81,6 +81,7 @@ def test_the_number_of_modes_with_a_velocity_is_a_switch_now() -> None:
     for modes, vibrations in ((27, True), (None, False)):
         new = with_present_names({**old, "modes": modes})
         assert new == {**old, "vibrations": vibrations} and with_present_names(new) == new
+    assert with_present_names(old) == old
 
 
 def test_a_setting_that_moved_into_a_group_is_found_there() -> None:
