@@ -188,6 +188,7 @@ class CorpusDataModule(ReadyDataModule):
                 f"{self._root} has {len(corpus)}."
             )
         chosen = [*(range(wanted) if self.knows_material else ()), *range(first, len(corpus))]
+        self.curriculum.see(self.seen)
         read = lru_cache(BODIES_IN_MEMORY)(corpus.body)
         return [_body_data(corpus, read, i, self.seen) for i in chosen]
 

@@ -16,6 +16,9 @@ from gausim.training.contracts import SceneBatch
 from gausim.training.contracts import Step as PredictedStep
 from gausim.training.rollout import Frame, States, after, windows
 
+# Frames of a rollout, tensor by tensor, from its two initial positions.
+Replay = Callable[..., tuple[Tensor, ...]]
+
 
 class _Stretch(nn.Module):
     """T steps of a batch, from tensors to tensors."""
@@ -43,9 +46,7 @@ class GraphedRollouts:
     def __init__(self, model: nn.Module) -> None:
         """Starts without a capture."""
         self._model = model
-        self._kept: dict[
-            object, tuple[object, Callable[..., tuple[Tensor, ...]]]
-        ] = {}  # what it holds for, and the capture
+        self._kept: dict[object, tuple[object, Replay]] = {}  # what it holds for, and the capture
 
     @property
     def serves(self) -> bool:
@@ -87,7 +88,7 @@ class GraphedRollouts:
         made = [x.clone() for x in self._kept[kind][1](*given)]  # the next replay overwrites what the capture returns
         return [Frame(*own) for own in zip(*made, strict=True)]
 
-    def _capture(self, stretch: _Stretch, initial: SimState) -> Callable[..., tuple[Tensor, ...]]:
+    def _capture(self, stretch: _Stretch, initial: SimState) -> Replay:
         given = tuple(x.detach().clone().requires_grad_(x.requires_grad) for x in (initial.positions, initial.previous))
         kept = [buffer.clone() for buffer in self._model.buffers()]  # rollouts before the capture are not to count
         gc.collect()  # during a capture no earlier one may be freed
@@ -102,4 +103,4 @@ class GraphedRollouts:
         with torch.no_grad():
             for buffer, value in zip(self._model.buffers(), kept, strict=True):
                 buffer.copy_(value)
-        return cast(Callable[..., tuple[Tensor, ...]], made)
+        return cast(Replay, made)
