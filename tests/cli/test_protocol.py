@@ -17,6 +17,7 @@ from gausim.cli.training_run import check_protocol
 from gausim.core import ConfigError, DataError, RunError
 from gausim.data import frames as frames_of_files
 from gausim.data import records
+from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.data.reserved import reserved_part
 from gausim.doctor.examine import examine
@@ -202,7 +203,7 @@ def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(
     part: str | None, trials: int | None, reserved: str, message: str, toy: Path
 ) -> None:
     names: Any = "all" if reserved == "all" else [name for name in [reserved] if name]
-    data: Any = SimpleNamespace(objects=[ObjectData(toy, test={"sequences": names})], has_videos=True)
+    data = ReadyDataModule(toy, test={"sequences": names})
     cfg = OmegaConf.create({"protocol": {"part": part, "trials": trials}, "evaluate": True})
     if not message:
         check_protocol(cfg, data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import UInt8
@@ -72,9 +72,13 @@ class SequenceIndex(Dataset):
     As a data set for training it returns only frames 0..T of the training views.
     """
 
-    def __init__(self, objects: Sequence[ObjectData]) -> None:
-        """Lists all sequences of these objects (reads their transforms, but no image)."""
-        self.objects = list(objects)
+    def __init__(self, objects: Sequence[Any]) -> None:
+        """Lists all sequences of these objects (reads their transforms, but no image).
+
+        Args:
+            objects: each an :class:`gausim.data.objects.ObjectData`, or what has the parts of it that are read here.
+        """
+        self.objects: list[ObjectData] = list(objects)
         self.entries: list[tuple[int, SequenceRecord]] = [
             (scene_id, record) for scene_id, item in enumerate(self.objects) for record in item.sequences
         ]

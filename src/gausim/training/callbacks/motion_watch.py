@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.objects import ObjectData
+from gausim.data.pretraining import BodyData
 from gausim.data.records import GroundTruth
 from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
@@ -84,9 +86,12 @@ class MotionWatch(Callback):
         return rows
 
     def _predicted(
-        self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
+        self, module: GausSimModule, item: Any, scene_id: int, first: int
     ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
-        """True and predicted motion of each sequence, and the kernels that the points are attached to."""
+        """True and predicted motion of each sequence, and the kernels that the points are attached to.
+
+        ``item`` is the object, an ``ObjectData`` or a ``BodyData``.
+        """
         points = item.rest_points
         if points is None:
             return
@@ -111,7 +116,7 @@ def _is_shown(record: object) -> bool:
 
 
 def figures(
-    found: Sequence[tuple[GroundTruth, Tensor, Tensor]], item: ObjectData, units: Sequence[Tensor]
+    found: Sequence[tuple[GroundTruth, Tensor, Tensor]], item: ObjectData | BodyData, units: Sequence[Tensor]
 ) -> dict[str, float]:
     """The figures of one object, without those that cannot be computed."""
     unseen, diagnosis = item.train_frames.stop, Diagnosis(item.fps)
