@@ -116,13 +116,12 @@ def _arguments(stage: str, options: Mapping[str, Any], made: Mapping[str, Path],
             raise ConfigError(
                 f"{where}: {key!r} is no option's name; YAML takes words such as no, on and 1 for values."
             )
+        flag = f"--{key.replace('_', '-')}"
         texts = [_text(v, made, base, f"{where}.{key}") for v in (value if isinstance(value, list) else [value])]
         if key in STAGES[stage]:
             first += texts
-        elif value is True:
-            rest.append(f"--{key.replace('_', '-')}")
         elif value is not False:
-            rest += [f"--{key.replace('_', '-')}", *texts]
+            rest += [flag] if value is True else [flag, *texts]
     return [*first, *rest]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from data_prep.public.fields import field, inside, lens, numbered, rate_of, read_list, viewmat
 from data_prep.public.importing import Importer, ImportOptions, rate_option
-from data_prep.public.pictures import CutOut, before_white, read_sized, size_of, with_alpha, without_pixels
+from data_prep.public.pictures import before_white, cut_out, read_sized, size_of, straight, with_alpha
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import DataError
 
@@ -45,8 +45,6 @@ class _Image:
     """One entry of ``all_data.json``."""
 
     where: str  # file and field
-    camera: int
-    frame: int
     path: Path
     time: float
     viewmat: np.ndarray
@@ -60,16 +58,10 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
         DataError: ``all_data.json`` or a picture is missing or malformed, or a camera moves.
     """
     path = root / DATA
-    by_camera: dict[int, dict[int, _Image]] = {}
-    for image in _images(root, path):
-        frames = by_camera.setdefault(image.camera, {})
-        if image.frame in frames:
-            raise DataError(f"{image.where}: field 'file_path' '{image.path.name}' stands twice.")
-        frames[image.frame] = image
     views, pictures, times = [], {}, {}
-    for camera, frames in sorted(by_camera.items()):
+    for camera, frames in sorted(_images(root, path).items()):
         rows = [frames[number] for number in sorted(frames) if number >= 0]
-        paths = numbered({row.frame: row.path for row in rows}, f"{path}: camera {camera}")
+        paths = numbered({n: image.path for n, image in frames.items() if n >= 0}, f"{path}: camera {camera}")
         view = _view(camera, rows)
         views.append(view)
         pictures[view.name] = _pictures(paths, camera, view.size)
@@ -83,8 +75,9 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
     )  # fmt: skip
 
 
-def _images(root: Path, path: Path) -> list[_Image]:
-    images = []
+def _images(root: Path, path: Path) -> dict[int, dict[int, _Image]]:
+    """The images by camera and frame."""
+    images: dict[int, dict[int, _Image]] = {}
     for i, entry in enumerate(read_list(path, "images")):
         where = f"{path}: [{i}]"
         name = field(entry, "file_path", str, where)
@@ -95,7 +88,10 @@ def _images(root: Path, path: Path) -> list[_Image]:
         pose = viewmat(field(entry, "c2w", list, where), f"{where}: field 'c2w'", opengl=True, inverse=True)
         k = lens(field(entry, "intrinsic", list, where), f"{where}: field 'intrinsic'")
         time = field(entry, "time", float, where)
-        images.append(_Image(where, int(match[1]), int(match[2]), place, time, pose, k))
+        frames, number = images.setdefault(int(match[1]), {}), int(match[2])
+        if number in frames:
+            raise DataError(f"{where}: field 'file_path' '{place.name}' stands twice.")
+        frames[number] = _Image(where, place, time, pose, k)
     return images
 
 
@@ -137,7 +133,7 @@ def _pictures(paths: tuple[Path, ...], camera: int, size: tuple[int, int]) -> tu
     elif any(p.is_file() for p in matted):
         rows = [((m, p, plate), partial(_unmatted, m, p, plate, size)) for m, p in zip(matted, paths, strict=True)]
     else:
-        cut = CutOut(paths, plate)
+        cut = cut_out(paths, plate)
         rows = [((p, plate), partial(cut, i)) for i, p in enumerate(paths)]
     return tuple(Picture((*files, *beside), partial(_cleared, read, *beside)) for files, read in rows)
 
@@ -148,8 +144,12 @@ def _unmatted(matted: Path, picture: Path, plate: Path, size: tuple[int, int]) -
 
 
 def _cleared(read: Callable[[], np.ndarray], ignored: Path | None = None) -> np.ndarray:
+    """The picture, with alpha 0 where that of the picture ``ignored`` is above a threshold."""
     pixels = read()
-    return pixels if ignored is None else without_pixels(pixels, ignored, IGNORED_ALPHA)
+    if ignored is None:
+        return pixels
+    marked = read_sized(ignored, (pixels.shape[1], pixels.shape[0]), "the pixels to ignore")[..., 3] > IGNORED_ALPHA
+    return straight(pixels[..., :3], np.where(marked, 0, pixels[..., 3]))
 
 
 def _rate(path: Path, times: dict[str, list[float]]) -> float:

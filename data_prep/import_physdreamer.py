@@ -13,21 +13,26 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from data_prep.capture.cameras.output import PosedWriter
+from data_prep.capture.cameras.sources import Posed, fitted, from_model, photos_of_model, read_lens_transforms
+from data_prep.capture.films.film import probe
+from data_prep.capture.masks.clips import film_frames
 from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
 from data_prep.common.objects import described, object_facts, refuse_faults, train_command
-from data_prep.common.photos import list_images, natural
+from data_prep.common.photos import list_images, natural, open_photo
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.fields import check_name
+from data_prep.public.importing import rate_option
+from data_prep.ready.authors import SCENE, scene_files, write_scene
 from gausim.core.errors import ConfigError, DataError
+from gausim.io.colmap import colmap_files, find_colmap, read_colmap
 from gausim.io.files import write_json
-
-if TYPE_CHECKING:
-    from data_prep.capture.cameras.sources import Posed
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -47,9 +52,7 @@ class PhysDreamerOptions(Options):
         None, f"first frames to train on ({TRAIN_FRAMES}, or all of fewer)", least=2, metavar="N"
     )
     view: str | None = option(None, "still from whose place the motion was filmed (the film's name begins with it)")
-    fps: float | None = option(
-        None, "frames per second (the film's; has to be stated of PNG frames)", least=1e-3, most=1e4
-    )
+    fps: float | None = rate_option("the film's; has to be stated of PNG frames")
     near: float = option(0.01, "distance to the point clouds [scene units] (%(default)s)", least=1e-9, most=1e6)
     anchor: float = option(
         0.05, "kernels of the object this near to what moves, but not moving, are pinned [scene units] (%(default)s)",
@@ -66,6 +69,18 @@ class _Capture:
     view: str  # the still from whose place was filmed
     films: tuple[Path, ...]  # one per sequence, or one folder of frames
     files: Mapping[str, Path]  # what is read besides pictures
+
+    def still_mask(self, photo: Path) -> Path | None:
+        """The mask of a still, where there is one."""
+        path = self.root / "masks" / f"{photo.stem}_mask.png"
+        return path if path.is_file() else None
+
+    def pictures(self) -> list[Path]:
+        """Photos, their masks and films."""
+        photos = [shot.photo.path for shot in self.posed.values()]
+        masks = [mask for mask in map(self.still_mask, photos) if mask is not None]
+        frames = [list_images(film) if film.is_dir() else [film] for film in self.films]
+        return [*photos, *masks, *chain(*frames)]
 
 
 def import_physdreamer(
@@ -84,7 +99,7 @@ def import_physdreamer(
         raise ConfigError(
             f"--video-masks {video_masks}: no such folder. Expected masks named like the frames, 0000.png …"
         )
-    inputs = {**found.files, **_pictures(found)}
+    inputs = {**found.files, **{path.relative_to(root).as_posix(): path for path in found.pictures()}}
     inputs |= {f"mask {path.name}": path for path in (list_images(video_masks) if video_masks is not None else ())}
     stage = Stage(STAGE, REVISION, inputs, asdict(options), ("av", "numpy", "opencv-python-headless", "pycolmap"))
     return run_stage(stage, out, lambda work: _make(work, out, found, options, video_masks, tick), force=force)
@@ -97,10 +112,6 @@ def read_capture(root: Path, options: PhysDreamerOptions) -> _Capture:
         DataError: poses, photos, a film or the scene are missing or malformed.
         ConfigError: no still, or more than one, was the film's place.
     """
-    from data_prep.capture.cameras.sources import from_model, photos_of_model, read_lens_transforms
-    from data_prep.ready.parts import SCENE, scene_files
-    from gausim.io.colmap import colmap_files, find_colmap, read_colmap
-
     if (root / BLENDER).is_file():
         shots, poses = read_lens_transforms(root / BLENDER), {BLENDER: root / BLENDER}
     else:
@@ -146,32 +157,14 @@ def _films(folder: Path, posed: Mapping[str, Posed], options: PhysDreamerOptions
     return view, chosen_films
 
 
-def _pictures(found: _Capture) -> dict[str, Path]:
-    """Photos, their masks and films, by name."""
-    paths = [shot.photo.path for shot in found.posed.values()]
-    paths += [mask for mask in (_still_mask(found.root, path) for path in paths) if mask is not None]
-    for film in found.films:
-        paths += list_images(film) if film.is_dir() else [film]
-    return {path.relative_to(found.root).as_posix(): path for path in paths}
-
-
-def _still_mask(root: Path, photo: Path) -> Path | None:
-    """The mask of a still, where there is one."""
-    path = root / "masks" / f"{photo.stem}_mask.png"
-    return path if path.is_file() else None
-
-
 def _make(
     work: Path, out: Path, found: _Capture, options: PhysDreamerOptions, masks: Path | None, tick: Tick
 ) -> dict[str, Any]:
-    from data_prep.capture.cameras.output import PosedWriter
-    from data_prep.ready.parts import write_scene
-
-    stills = {shot.photo.path for shot in found.posed.values()}
+    stills, place = {shot.photo.path for shot in found.posed.values()}, found.posed[found.view]
 
     def mask_of(path: Path) -> Path | None:
         if path in stills:
-            return _still_mask(found.root, path)
+            return found.still_mask(path)
         mask = masks / f"{path.stem}.png" if masks is not None else None
         if mask is not None and not mask.is_file():
             raise DataError(f"{mask}: no mask of the frame {path.name}. Restore it, or leave --video-masks out.")
@@ -184,9 +177,9 @@ def _make(
         name = f"seq_{number:03d}"
         folder, rate = _frames(film, work / FRAMES / name, options)
         rates.add(rate)
-        frames[name] = writer.sequence(
-            work / "sequences" / name, {found.view: folder}, {found.view: _camera(found, folder)}, rate
-        )
+        first = open_photo(list_images(folder)[0], found.view)
+        camera = replace(place, photo=first, camera=fitted(place.camera, first))
+        frames[name] = writer.sequence(work / "sequences" / name, {found.view: folder}, {found.view: camera}, rate)
     shutil.rmtree(work / FRAMES, ignore_errors=True)
     if len(rates) > 1:
         raise DataError(
@@ -209,24 +202,12 @@ def _make(
 
 def _frames(film: Path, folder: Path, options: PhysDreamerOptions) -> tuple[Path, float]:
     """The folder of a film's frames, and their rate."""
-    from data_prep.capture.films.film import probe
-    from data_prep.capture.masks.clips import film_frames
-
     if film.is_dir():
         assert options.fps is not None
         return film, options.fps
     rate = float(probe(film).rate)
     film_frames(film, folder)
     return folder, options.fps or rate
-
-
-def _camera(found: _Capture, folder: Path) -> Posed:
-    """The still's camera for the size of the frames."""
-    from data_prep.capture.cameras.sources import Posed, fitted
-    from data_prep.common.photos import open_photo
-
-    still, first = found.posed[found.view], open_photo(list_images(folder)[0], found.view)
-    return Posed(first, fitted(still.camera, first), still.viewmat, still.xy, still.point_ids)
 
 
 def _facts(found: _Capture, options: PhysDreamerOptions, fps: float, shortest: int) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import pdist
 
 from data_prep.common.command import option
 from data_prep.public.fields import REMEDY, field, lens, numbers, viewmat
@@ -157,15 +159,13 @@ def _final(path: Path, count: int) -> dict[str, np.ndarray]:
     data = read_pickle(path)
     if not isinstance(data, dict):
         raise DataError(f"{path}: expected a dict of arrays, got a {type(data).__name__}. {REMEDY}")
-    shapes = {"controller_points": (count, -1, 3), "object_points": (count, -1, 3)}
-    missing = [key for key in shapes if key not in data]
-    if missing:
-        raise DataError(f"{path}: field '{missing[0]}' is missing, found {sorted(map(str, data))[:12]}. {REMEDY}")
-    found = {key: numbers(data[key], shape, f"{path}: field '{key}'") for key, shape in shapes.items()}
+    found = {}
+    for key in ("controller_points", "object_points"):
+        found[key] = numbers(field(data, key, Any, str(path)), (count, -1, 3), f"{path}: field '{key}'")
     if found["controller_points"].shape[1] > _MOST_CONTROLLERS:
         raise DataError(f"{path}: field 'controller_points' has more than {_MOST_CONTROLLERS} points. {REMEDY}")
     if "object_colors" in data:
-        shape = (*found["object_points"].shape,)
+        shape = found["object_points"].shape
         found["object_colors"] = numbers(data["object_colors"], shape, f"{path}: field 'object_colors'")
     return found
 
@@ -195,28 +195,18 @@ def together(paths: np.ndarray, count: int) -> np.ndarray:
     Points of a hand stay near each other: points are joined by the largest distance that they ever have (average
     linkage). Hands are numbered in the order of their first points.
     """
-    from scipy.cluster.hierarchy import fcluster, linkage
-    from scipy.spatial.distance import squareform
-
-    points = paths.shape[1]
-    if count == 1 or points == 1:
-        return np.zeros(points, np.int64)
-    apart = np.zeros((points, points))
-    for frame in paths:
-        apart = np.maximum(apart, np.linalg.norm(frame[:, None] - frame[None], axis=-1))
-    labels = fcluster(linkage(squareform(apart, checks=False), "average"), count, "maxclust")
-    order = {label: i for i, label in enumerate(dict.fromkeys(labels.tolist()))}
-    return np.array([order[label] for label in labels.tolist()], np.int64)
+    if count == 1 or paths.shape[1] == 1:
+        return np.zeros(paths.shape[1], np.int64)
+    apart = np.max([pdist(frame) for frame in paths], axis=0)
+    labels = fcluster(linkage(apart, "average"), count, "maxclust").tolist()
+    order = list(dict.fromkeys(labels))
+    return np.array([order.index(label) for label in labels], np.int64)
 
 
 def stretch(points: np.ndarray) -> float:
     """The most that a distance between two of the points (F, C, 3) differs from that in frame 0."""
-
-    def apart(frame: np.ndarray) -> np.ndarray:
-        return np.asarray(np.linalg.norm(frame[:, None] - frame[None], axis=-1))
-
-    first = apart(points[0])
-    return float(max(np.abs(apart(frame) - first).max() for frame in points))
+    apart = np.array([pdist(frame) for frame in points])
+    return float(np.abs(apart - apart[0]).max(initial=0.0))
 
 
 def _tracks(path: Path, count: int) -> tuple[np.ndarray | None, int]:

@@ -13,17 +13,16 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from data_prep.capture.cameras.output import PosedWriter, write_points
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
 from data_prep.common.objects import object_facts
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
+from data_prep.ready.authors import ReadyFiles, find_files, sequence_poses, write_scene
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
-
-if TYPE_CHECKING:
-    from data_prep.ready.authors import ReadyFiles
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -58,8 +57,6 @@ def import_ready(
         DataError: a file is missing or malformed, or the sequences have no camera in common.
         SceneError: the point cloud is no 3DGS scene, or a mask marks nothing.
     """
-    from data_prep.ready.authors import find_files
-
     files = find_files(root, image_masks, video_masks)
     unknown = sorted(set(options.heldout) - set(files.views))
     if unknown or set(options.heldout) == set(files.views):
@@ -71,10 +68,6 @@ def import_ready(
 
 
 def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> dict[str, Any]:
-    from data_prep.capture.cameras.output import PosedWriter, write_points
-    from data_prep.ready.authors import sequence_poses
-    from data_prep.ready.parts import write_scene
-
     writer = PosedWriter(tick, files.mask)
     results: dict[str, Any] = {"stills": len(files.stills), "sequences": {}, "left_out": files.left_out}
     if files.stills:

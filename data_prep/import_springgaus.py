@@ -17,24 +17,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_prep.capture.cameras.sources import fitted
+from data_prep.capture.masks.clips import read_picture
 from data_prep.common.command import option
 from data_prep.common.photos import list_images, natural, open_photo
 from data_prep.common.progress import Tick
-from data_prep.public.fields import (
-    check_name,
-    field,
-    inside,
-    lens,
-    numbered,
-    numbers,
-    rate_of,
-    read_list,
-    viewmat,
-)
+from data_prep.public.fields import check_name, field, inside, lens, numbered, numbers, rate_of, read_list, viewmat
 from data_prep.public.importing import Importer, ImportOptions, rate_option
-from data_prep.public.pictures import masked, size_of, with_alpha
+from data_prep.public.pictures import brightness, masked, read_sized, resized, size_of, straight, with_alpha
 from data_prep.public.registration import register
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
@@ -174,8 +166,6 @@ def read_real(root: Path, options: SpringGausOptions) -> PublicObject:
 
 def _calibration(path: Path) -> dict[str, np.ndarray]:
     """World to camera of every camera."""
-    from scipy.spatial.transform import Rotation
-
     data, poses = read_any_json(path), {}
     if not isinstance(data, dict) or not data:
         raise DataError(f"{path}: expected an object of cameras with 'rvecs' and 'tvecs', got {str(data)[:60]}.")
@@ -265,9 +255,6 @@ def _photo(folder: Path, name: str) -> Path:
 
 def _still(photo: Path, mask: Path, size: tuple[int, int]) -> np.ndarray:
     """A photo, reduced to its mask's size as the authors do, with the mask as alpha."""
-    from data_prep.capture.masks.clips import read_picture
-    from data_prep.public.pictures import brightness, read_sized, resized, straight
-
     rgb = resized(read_picture(photo), size)[..., :3]
     return straight(rgb, brightness(read_sized(mask, size, f"the mask of {photo.name}")))
 

@@ -90,10 +90,9 @@ def select(
 def _facts(scene: GaussianScene) -> dict[str, Any]:
     facts: dict[str, Any] = {"kernels": scene.count}
     for name in MASKS:
-        mask = getattr(scene, name)
-        inside = scene.means[mask]
+        inside = scene.means[getattr(scene, name)]
         box = [inside.amin(0).tolist(), inside.amax(0).tolist()] if len(inside) else None
-        facts[name] = {"kernels": int(mask.sum()), "box": box}
+        facts[name] = {"kernels": len(inside), "box": box}
     return facts
 
 
@@ -116,7 +115,7 @@ def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
     from gausim.ops.orbit import orbit_cameras
     from gausim.ops.spherical_harmonics import C0
     from gausim.render.cpu import CpuRenderer
-    from gausim.render.draw import draw
+    from gausim.render.draw import draw_still, to_bytes
 
     mask = getattr(scene, name)
     color = scene.sh[:, 0] * C0 + 0.5
@@ -125,12 +124,8 @@ def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
     color = torch.where(mask[:, None], tinted, grey.expand_as(color))
     flat = replace(scene, sh=((color - 0.5) / C0)[:, None])
     cameras = orbit_cameras(scene.means, azimuths=AZIMUTHS, up=up, size=(size, size))
-    still = torch.eye(3).expand(1, 1, 3, 3)
-    units = torch.zeros(scene.count, dtype=torch.long)
-    with torch.inference_mode():
-        white = torch.ones(3)
-        drawn = draw(CpuRenderer(), flat, scene.means[None], still, still, units, cameras, background=white).rgb[0]
-    return np.ascontiguousarray((drawn.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()[..., ::-1])
+    drawn = draw_still(CpuRenderer(), flat, cameras, background=torch.ones(3)).rgb[0]
+    return np.ascontiguousarray(to_bytes(drawn).numpy()[..., ::-1])
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -74,10 +74,7 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
             array = np.array(checked(value, _NESTED[len(shape)], where, REMEDY), np.float64)
     except ValueError:
         raise DataError(f"{wrong}, got rows of different lengths. {REMEDY}") from None
-    fits = array.ndim == len(shape) and all(
-        n == m or (n < 0 and m > 0) for n, m in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
+    if array.ndim != len(shape) or not all(n == m or n < 0 < m for n, m in zip(shape, array.shape, strict=True)):
         raise DataError(f"{wrong}, got shape {tuple(array.shape)}. {REMEDY}")
     if not (np.abs(array) <= _LARGEST).all():
         raise DataError(f"{wrong} up to {_LARGEST:g}, found NaN, infinity or more. {REMEDY}")

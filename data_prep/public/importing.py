@@ -84,15 +84,11 @@ class Importer(Generic[T]):
 
         def run(given: argparse.Namespace, tick: Tick) -> str:
             manifest = self(given.root, given.out, chosen(self.kind, given), force=given.force, tick=tick)
-            return "\n".join([headline(given.out, manifest), *summaries(manifest["results"], given.out)])
+            made = manifest["results"]["objects"]
+            told = [summary(made[name], given.out / name if len(made) > 1 else given.out) for name in made]
+            return "\n".join([headline(given.out, manifest), *told])
 
         return run_command(parser, argv, run)
-
-
-def summaries(results: Mapping[str, Any], out: Path) -> list[str]:
-    """A few lines about every object that was imported, for people."""
-    several = len(results["objects"]) > 1
-    return [summary(made, out / name if several else out) for name, made in results["objects"].items()]
 
 
 def summary(results: Mapping[str, Any], out: Path) -> str:

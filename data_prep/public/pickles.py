@@ -12,6 +12,8 @@ import re
 import struct
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -53,22 +55,20 @@ def read_pickle(path: Path) -> Any:
         ) from error
 
 
+@dataclass
 class _Element:
     """Type of an array's elements, before and after its byte order is known."""
 
-    def __init__(self, code: str) -> None:
-        self.code, self.order = code, "="
+    code: str
+    order: str = "="
 
     @property
     def dtype(self) -> np.dtype:
         return np.dtype(self.order.replace("|", "=") + self.code)
 
 
-def _refusal(name: str) -> Callable[[Any], None]:
-    def refuse(_: Any) -> None:
-        raise ValueError(f"opcode {name} makes no plain data")
-
-    return refuse
+def _refuse(name: str, _: Any) -> None:
+    raise ValueError(f"opcode {name} makes no plain data")
 
 
 class _Reader(pickle._Unpickler):
@@ -89,7 +89,7 @@ class _Reader(pickle._Unpickler):
             "numpy._core.multiarray.scalar": self._make_scalar,
             "numpy._core.numeric._frombuffer": self._make_array,
             "_codecs.encode": self._encode,
-            "__builtin__.bytes": self._no_bytes,  # how old protocols write bytes without content
+            "__builtin__.bytes": lambda: b"",  # how old protocols write bytes without content
         }
 
     def plain(self) -> Any:
@@ -132,7 +132,7 @@ class _Reader(pickle._Unpickler):
 
     dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
         **pickle._Unpickler.dispatch,
-        **{getattr(pickle, name)[0]: _refusal(name) for name in _REFUSED},
+        **{getattr(pickle, name)[0]: partial(_refuse, name) for name in _REFUSED},
         pickle.BUILD[0]: load_build,
     }
 
@@ -157,9 +157,6 @@ class _Reader(pickle._Unpickler):
 
     def _make_scalar(self, element: Any, raw: Any) -> Any:
         return np.frombuffer(raw, self._checked(raw, element, ()))[0].item()
-
-    def _no_bytes(self) -> bytes:
-        return b""
 
     def _encode(self, text: Any, encoding: Any) -> bytes:
         if type(text) is not str or encoding != "latin1":

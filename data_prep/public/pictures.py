@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from data_prep.capture.masks.clips import read_picture
+from data_prep.capture.masks.cleanup import Cleanup, cleaned, matte
+from data_prep.capture.masks.clips import Clip, read_picture
+from data_prep.capture.masks.segmenters import BackgroundSegmenter
 from data_prep.common.photos import open_photo
 from gausim.core.errors import DataError
-
-if TYPE_CHECKING:
-    from data_prep.capture.masks.segmenters import MaskOf
 
 # Mask pictures are white on black; brighter than this is the object.
 HALF = 127
@@ -96,24 +95,8 @@ def before_white(matted: np.ndarray, picture: np.ndarray, plate: np.ndarray) -> 
     alpha = 1 - np.where(length > _TELLING, through, plain).clip(0, 1)
     # Two roundings to 8 bits: a coverage below this is none.
     alpha[plain | (alpha < 2 / 255)] = 0
-    return _uncovered(matted, alpha)
-
-
-def _uncovered(matted: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Straight colour under a coverage (H, W) of a picture before white."""
-    covered = np.maximum(alpha, 1 / 255)[..., None]
-    rgb = (matted - (1 - alpha[..., None]) * 255) / covered
+    rgb = (matted - (1 - alpha[..., None]) * 255) / np.maximum(alpha, 1 / 255)[..., None]
     return straight(rgb.clip(0, 255).round(), (255 * alpha).round())
-
-
-def without_pixels(pixels: np.ndarray, path: Path, threshold: int) -> np.ndarray:
-    """RGBA whose alpha is 0 where the alpha of the picture at ``path`` is above a threshold.
-
-    Raises:
-        DataError: that picture is of another size.
-    """
-    ignored = read_sized(path, (pixels.shape[1], pixels.shape[0]), "the pixels to ignore")[..., 3] > threshold
-    return straight(pixels[..., :3], np.where(ignored, 0, pixels[..., 3]))
 
 
 def resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -128,27 +111,19 @@ def resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.asarray((out.clip(0, 255) + 0.5).astype(np.uint8))
 
 
-class CutOut:
-    """RGBA of the frames of a fixed camera before a plate, as `segment --backend background --plate` makes them."""
+def cut_out(frames: Sequence[Path], plate: Path) -> Callable[[int], np.ndarray]:
+    """Cuts a fixed camera's frames out before a plate, as `segment --backend background --plate` does.
 
-    def __init__(self, frames: Sequence[Path], plate: Path) -> None:
-        """Takes the frames of one folder and the picture of the empty scene; reads them at the first call."""
-        self._frames, self._plate = frames, plate
-        self._mask_of: MaskOf | None = None
+    Returns:
+        What gives (H, W, 4) uint8 of the frame of a number; it reads at its first call, and raises a
+        :class:`DataError` where a picture or the plate is missing or of another size.
+    """
+    folder = frames[0].parent
+    clip = Clip(folder.name, folder, tuple(Path(path.name) for path in frames), moving=True)
+    opened = cache(BackgroundSegmenter(plate=plate).open)
 
-    def __call__(self, index: int) -> np.ndarray:
-        """(H, W, 4) uint8 of a frame.
-
-        Raises:
-            DataError: a picture or the plate is missing or of another size.
-        """
-        from data_prep.capture.masks.cleanup import Cleanup, cleaned, matte
-        from data_prep.capture.masks.clips import Clip
-        from data_prep.capture.masks.segmenters import BackgroundSegmenter
-
-        folder = self._frames[0].parent
-        clip = Clip(folder.name, folder, tuple(Path(path.name) for path in self._frames), moving=True)
-        if self._mask_of is None:
-            self._mask_of = BackgroundSegmenter(plate=self._plate).open(clip)
+    def frame(index: int) -> np.ndarray:
         rgb = clip.rgb(index)
-        return matte(rgb, cleaned(self._mask_of(index), rgb, Cleanup(), soft=False))
+        return matte(rgb, cleaned(opened(clip)(index), rgb, Cleanup(), soft=False))
+
+    return frame

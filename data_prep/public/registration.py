@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -37,7 +37,19 @@ COARSE, FINE = 0.15, 0.04
 CLOSE, APART = 0.03, 20.0
 # Correlations of colours that differ by less decide nothing.
 UNDECIDED = 0.1
-_Fit = tuple[float, np.ndarray, float, np.ndarray]  # overlap, rotation, scale, shift
+
+
+class _Fit(NamedTuple):
+    """A place that the body may have."""
+
+    overlap: float
+    rotation: np.ndarray
+    scale: float
+    shift: np.ndarray
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the body in the frames' world."""
+        return points @ self.rotation.T * self.scale + self.shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,30 +113,25 @@ def register(
     """
     body, windows = _body(stills, tick), [_window(view, picture) for view, picture in frames]
     chosen = body.points[:: max(1, len(body.points) // TRIED_POINTS)]
-    tried = []
-    for i, rotation in enumerate(_turns(turns)):
-        scale, shift = _placed(chosen @ rotation.T, windows)
-        tried.append(
-            (_overlap(chosen @ rotation.T * scale + shift, windows, thin=True).mean(), i, rotation, scale, shift)
-        )
-        tick("turns", i + 1, turns)
-    tried.sort(key=lambda one: (-one[0], one[1]))
-    found = []
-    for i, (_, _, *start) in enumerate(_spread(tried)):
-        found.append(_refined(body, windows, (0.0, *start), COARSE))
-        tick("refining", i + 1, REFINED)
-    top = max(fit[0] for fit in found)
+    tried, found = list[_Fit](), list[_Fit]()
+    for i, rotation in enumerate(_turns(turns), 1):
+        tried.append(_placed(chosen, rotation, windows))
+        tick("turns", i, turns)
+    for i, fit in enumerate(_spread(tried), 1):
+        found.append(_refined(body, windows, fit, COARSE))
+        tick("refining", i, REFINED)
+    top = max(fit.overlap for fit in found)
     for step in (COARSE, FINE):  # begun again, as the method's simplex may have collapsed early
-        found = [_refined(body, windows, fit, step) for fit in found if fit[0] > top - 2 * CLOSE]
+        found = [_refined(body, windows, fit, step) for fit in found if fit.overlap > top - 2 * CLOSE]
     return _best(body, windows, found)
 
 
-def _spread(tried: list[tuple]) -> list[tuple]:
-    """The best turns of which none is close to a better one."""
-    kept: list[tuple] = []
-    for one in tried:
-        if len(kept) < REFINED and all(_angle(one[2], other[2]) > APART / 2 for other in kept):
-            kept.append(one)
+def _spread(tried: list[_Fit]) -> list[_Fit]:
+    """The best turns, best first, of which none is close to a better one."""
+    kept: list[_Fit] = []
+    for fit in sorted(tried, key=lambda fit: -fit.overlap):
+        if len(kept) < REFINED and all(_angle(fit, other) > APART / 2 for other in kept):
+            kept.append(fit)
     return kept
 
 
@@ -143,28 +150,24 @@ def _body(stills: Sequence[tuple[View, Picture]], tick: Tick) -> _Body:
 
     from gausim.ops.visual_hull import carve
 
-    masks, ks, pictures = [], [], []
-    for i, (view, picture) in enumerate(stills):
-        small = view.smaller(CARVED)
-        pixels = resized(picture.read(), small.size)
-        masks.append(pixels[..., 3] > HALF)
-        ks.append(small.k)
-        pictures.append(pixels)
-        tick("hull", i + 1, len(stills))
-    if len({mask.shape for mask in masks}) > 1:
+    pictures, views = [], [view.smaller(CARVED) for view, _ in stills]
+    for i, (view, (_, picture)) in enumerate(zip(views, stills, strict=True), 1):
+        pictures.append(resized(picture.read(), view.size))
+        tick("hull", i, len(stills))
+    if len({pixels.shape for pixels in pictures}) > 1:
         raise DataError(
             f"{stills[0][1].files[0].parent}: stills differ in size; the masks of one object need one size."
         )
-    viewmats = np.stack([view.viewmat for view, _ in stills])
-    hull = carve(torch.from_numpy(np.stack(masks)), torch.from_numpy(viewmats).float(),
-                 torch.from_numpy(np.stack(ks)).float(), VOXELS, missing=MISSING)  # fmt: skip
+    viewmats, ks = np.stack([view.viewmat for view in views]), np.stack([view.k for view in views])
+    masks = torch.from_numpy(np.stack(pictures)[..., 3] > HALF)
+    hull = carve(masks, torch.from_numpy(viewmats).float(), torch.from_numpy(ks).float(), VOXELS, missing=MISSING)
     if hull is None or not hull.occupied.any():
         raise DataError(
             f"{stills[0][1].files[-1].parent}: the stills' masks have no common body. Check them against the poses."
         )
     points, normals = (part.double().numpy() for part in hull.surface())
     middle = (points.max(0) + points.min(0)) / 2
-    colors = _colors(points, normals, viewmats, np.stack(ks), pictures)
+    colors = _colors(points, normals, viewmats, ks, pictures)
     return _Body(points - middle, normals, colors, middle, float(np.linalg.norm(np.ptp(points, axis=0))))
 
 
@@ -240,9 +243,9 @@ def _overlap(points: np.ndarray, windows: Sequence[_Window], *, thin: bool = Fal
     return np.array(values)
 
 
-def _placed(turned: np.ndarray, windows: Sequence[_Window]) -> tuple[float, np.ndarray]:
-    """Scale and place at which turned points have silhouettes of the masks' sizes and middles."""
-    scale, shift = 1.0, _crossing(windows)
+def _placed(points: np.ndarray, rotation: np.ndarray, windows: Sequence[_Window]) -> _Fit:
+    """The fit of this rotation at which the points have silhouettes of the masks' sizes and middles."""
+    turned, scale, shift = points @ rotation.T, 1.0, _crossing(windows)
     for _ in range(PLACING_ROUNDS):
         ratios, normal, right = [], np.zeros((3, 3)), np.zeros(3)
         for window in windows:
@@ -252,20 +255,15 @@ def _placed(turned: np.ndarray, windows: Sequence[_Window]) -> tuple[float, np.n
             uv = _pixels(local, k) if local[:, 2].min() > 1e-3 * depth else local[:, :2] / depth * k[0, 0] + k[:2, 2]
             low, high = uv.min(0), uv.max(0)
             ratios.append(math.log(window.extent / max(1e-6, float(np.hypot(*(high - low))))))
-            now = (low + high) / 2 - k[:2, 2] + _principal(window, shift)
+            seen = _pixels((r @ shift + window.view.viewmat[:3, 3])[None], k)[0]  # the place's pixel
+            now = (low + high) / 2 - k[:2, 2] + seen
             away = (window.middle - now) * depth / k[[0, 1], [0, 1]]
-            across = r[:2].T @ r[:2]
-            normal += across
+            normal += r[:2].T @ r[:2]
             right += r[:2].T @ away
         scale *= math.exp(float(np.mean(ratios)))
         shift = shift + np.linalg.solve(normal + 1e-9 * np.eye(3), right)
-    return scale, shift
-
-
-def _principal(window: _Window, place: np.ndarray) -> np.ndarray:
-    """(2,) pixel at which a place is seen."""
-    local = window.view.viewmat[:3, :3] @ place + window.view.viewmat[:3, 3]
-    return _pixels(local[None], window.view.k)[0]
+    fit = _Fit(0.0, rotation, scale, shift)
+    return fit._replace(overlap=float(_overlap(fit(points), windows, thin=True).mean()))
 
 
 def _crossing(windows: Sequence[_Window]) -> np.ndarray:
@@ -279,48 +277,43 @@ def _crossing(windows: Sequence[_Window]) -> np.ndarray:
 
 def _refined(body: _Body, windows: Sequence[_Window], start: _Fit, step: float) -> _Fit:
     """The best fit near another one; ``step`` is how far its neighbours are looked for [radian, or of the size]."""
-    _, rotation, scale, shift = start
-    size = body.size * scale
+    size = body.size * start.scale
 
-    def parts(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-        turn = Rotation.from_rotvec(values[:3]).as_matrix() @ rotation
-        return turn, scale * math.exp(values[3]), shift + size * values[4:]
+    def moved(values: np.ndarray) -> _Fit:
+        turn = Rotation.from_rotvec(values[:3]).as_matrix() @ start.rotation
+        return _Fit(0.0, turn, start.scale * math.exp(values[3]), start.shift + size * values[4:])
 
     def loss(values: np.ndarray) -> float:
-        turn, factor, place = parts(values)
-        return -float(_overlap(body.points @ turn.T * factor + place, windows).mean())
+        return -float(_overlap(moved(values)(body.points), windows).mean())
 
     simplex = np.vstack((np.zeros(7), step * np.diag([1, 1, 1, 0.5, 0.3, 0.3, 0.3])))
     options = {"initial_simplex": simplex, "maxfev": REFINEMENT_STEPS, "xatol": 1e-4, "fatol": 1e-5}
     values = minimize(loss, np.zeros(7), method="Nelder-Mead", options=options).x
-    return (-loss(values), *parts(values))
+    return moved(values)._replace(overlap=-loss(values))
 
 
 def _best(body: _Body, windows: Sequence[_Window], found: list[_Fit]) -> Registration:
     """Of the fits that cover the masks alike, the one whose colours agree best."""
-    top = max(fit[0] for fit in found)
-    alike = [fit for fit in found if fit[0] > top - CLOSE]
+    top = max(fit.overlap for fit in found)
+    alike = [fit for fit in found if fit.overlap > top - CLOSE]
     agreement = [_agreement(body, windows, fit) for fit in alike]
-    best = int(np.argmax(agreement))
-    overlap, rotation, scale, shift = alike[best]
-    others = [a for fit, a in zip(alike, agreement, strict=True) if _angle(fit[1], rotation) > APART]
-    views = _overlap(body.points @ rotation.T * scale + shift, windows)
-    return Registration(
-        Similarity(scale, rotation, shift - scale * rotation @ body.middle), float(overlap),
-        {window.view.name: float(value) for window, value in zip(windows, views, strict=True)},
-        agreement[best], max(others, default=-1.0),
-    )  # fmt: skip
+    best = alike[int(np.argmax(agreement))]
+    others = [a for fit, a in zip(alike, agreement, strict=True) if _angle(fit, best) > APART]
+    views = _overlap(best(body.points), windows).tolist()
+    move = Similarity(best.scale, best.rotation, best.shift - best.scale * best.rotation @ body.middle)
+    by_view = {window.view.name: value for window, value in zip(windows, views, strict=True)}
+    return Registration(move, best.overlap, by_view, max(agreement), max(others, default=-1.0))
 
 
-def _angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Between two rotations [degree]."""
-    return math.degrees(math.acos(float(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1))))
+def _angle(first: _Fit, second: _Fit) -> float:
+    """Between the rotations of two fits [degree]."""
+    cosine = (np.trace(first.rotation.T @ second.rotation) - 1) / 2
+    return math.degrees(math.acos(float(np.clip(cosine, -1, 1))))
 
 
 def _agreement(body: _Body, windows: Sequence[_Window], fit: _Fit) -> float:
     """Correlation of the hull's colours with the frames', over cameras, whatever exposure and balance they have."""
-    _, rotation, scale, shift = fit
-    points, normals = body.points @ rotation.T * scale + shift, body.normals @ rotation.T
+    points, normals = fit(body.points), body.normals @ fit.rotation.T
     known = np.isfinite(body.colors[:, 0])
     scores = []
     for window in windows:

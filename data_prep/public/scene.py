@@ -105,11 +105,8 @@ class PublicObject:
                 fewer frames than are to be trained on.
             ConfigError: held-out cameras are no part of the cameras.
         """
-        named = {
-            "sequences": [motion.name for motion in self.motions],
-            "stills": [view.name for view, _ in self.stills],
-        }
-        for what, names in named.items():
+        sequences, stills = [motion.name for motion in self.motions], [view.name for view, _ in self.stills]
+        for what, names in (("sequences", sequences), ("stills", stills)):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise DataError(f"{self.root}: two {what} would get the name '{twice[0]}'. Rename one of their files.")

@@ -51,7 +51,7 @@ class ObjectWriter:
 
     def _motion(self, motion: Motion) -> None:
         folder = self._work / "sequences" / motion.name
-        done, entries, posed = 0, [], []
+        entries, posed = [], []
         for view in motion.views:
             small = view.smaller(self._longest)
             for number, picture in enumerate(motion.pictures[view.name]):
@@ -59,26 +59,23 @@ class ObjectWriter:
                 self._picture(folder / name, picture, view, small)
                 entries.append({"file_path": name, "camera": view.name, "frame": number})
                 posed.append(small)
-                done += 1
-                self._tick(motion.name, done, len(motion.views) * motion.count)
+                self._tick(motion.name, len(posed), len(motion.views) * motion.count)
         write_poses(folder / "transforms.json", posed, entries, self._found.fps)
         if motion.hands is not None:
             write_npz(folder / "hands.npz", points=motion.hands.points.astype(np.float32), hand=motion.hands.hand)
 
     def _stills(self) -> int:
         """Posed stills, or frame 0 of the first sequence in the cameras that are trained on."""
-        folder, shots = self._work / "static", list(self._found.stills)
-        if not shots:
-            first = self._found.motions[0]
-            shown = [view for view in first.views if view.name not in self._found.heldout]
-            for view in shown:
-                source = self._work / "sequences" / first.name / view.name / "0000.png"
-                copy_missing(source, folder / "images" / f"{view.name}.png")
-            posed = [view.smaller(self._longest) for view in shown]
-        else:
-            posed = [view.smaller(self._longest) for view, _ in shots]
-            for number, (small, (view, picture)) in enumerate(zip(posed, shots, strict=True), 1):
-                self._picture(folder / "images" / f"{view.name}.png", picture, view, small)
+        folder, first = self._work / "static", self._found.motions[0]
+        seen = [view for view in first.views if view.name not in self._found.heldout]
+        shots: Sequence[tuple[View, Picture | None]] = self._found.stills or [(view, None) for view in seen]
+        posed = [view.smaller(self._longest) for view, _ in shots]
+        for number, (small, (view, picture)) in enumerate(zip(posed, shots, strict=True), 1):
+            target = folder / "images" / f"{view.name}.png"
+            if picture is None:
+                copy_missing(self._work / "sequences" / first.name / view.name / "0000.png", target)
+            else:
+                self._picture(target, picture, view, small)
                 self._tick("stills", number, len(shots))
         entries = [{"file_path": f"images/{view.name}.png"} for view in posed]
         write_poses(folder / "transforms.json", posed, entries, None)

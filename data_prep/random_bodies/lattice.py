@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from data_prep.random_bodies.shapes import Field, Rng
-from data_prep.synthetic.bodies import CORNERS, Array, Body, Ints, tet_volumes
+from data_prep.synthetic.bodies import CORNERS, Body, Ints, tet_volumes
 
 EXTENT, FINEST = 1.04, 30  # half of the grid's edge; most cells along it
 SNAP, STEPS = 0.42, 3  # farthest that a node moves to the surface [cells]; Newton steps
@@ -92,9 +91,3 @@ def pinned(body: Body, kind: str, rng: Rng) -> Body | None:
     nodes = np.zeros(len(body.nodes), bool)
     nodes[body.cells[held]] = True
     return replace(body, held=nodes)
-
-
-def distance_to_pins(body: Body) -> Array:
-    """(N,) straight distance of each node from the nearest held one, the largest being 1."""
-    distance = cKDTree(body.nodes[body.held]).query(body.nodes)[0]
-    return distance / distance.max()

@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from data_prep.common.spread import farthest
 from data_prep.random_bodies.lattice import PINS, body_of, pinned, warped
 from data_prep.random_bodies.matter import Matter, Modes, modes_of, random_drag, random_matter
-from data_prep.random_bodies.motion import FiniteElements, MaterialPoints, Simulator
+from data_prep.random_bodies.motion import FiniteElements, MaterialPoints, Simulator, push_velocity, random_push
 from data_prep.random_bodies.plan import CELLS, DIAGONALS, KEPT_SWING, LEAST_VOLUME, PERIODS, RATES, Plan
-from data_prep.random_bodies.pushes import push_velocity, random_push
 from data_prep.random_bodies.shapes import SHAPES, Rng, from_mesh
 from data_prep.synthetic.bodies import Array, Body
 from data_prep.synthetic.embedding import CANDIDATES, Embedding, cover_surface
@@ -56,6 +55,8 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
         DivergenceError: none of many draws gave motion worth keeping, which no plan within its limits brings about.
     """
     shapes: list[str | Path] = [*SHAPES, *plan.meshes]
+    # Bodies of the second simulator are spread evenly over the corpus.
+    second = int((number + 1) * plan.second) > int(number * plan.second)
     redrawn = 0
     for trial in range(BODY_TRIALS):
         # Shape and pins stay for some trials, or those that are dear to simulate would be rare.
@@ -63,18 +64,13 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
         shape, pins = shapes[int(kinds.integers(len(shapes)))], str(kinds.choice(PINS))
         rng = np.random.default_rng([plan.seed, number, 2, trial])
         try:
-            subject = _draw(plan, shape, pins, rng, second=_is_second(plan, number))
+            subject = _draw(plan, shape, pins, rng, second=second)
             positions, pushes, failed = _sequences(plan, subject, rng)
         except (Rejected, DivergenceError):
             redrawn += 1
             continue
         return _result(plan, number, subject, positions, pushes, redrawn + failed)
     raise DivergenceError(f"body {number}: {BODY_TRIALS} draws gave no motion worth keeping. Choose another --swing.")
-
-
-def _is_second(plan: Plan, number: int) -> bool:
-    """Bodies of the second simulator are spread evenly over the corpus."""
-    return int((number + 1) * plan.second) > int(number * plan.second)
 
 
 def _draw(plan: Plan, kind: str | Path, pins: str, rng: Rng, *, second: bool) -> Subject:

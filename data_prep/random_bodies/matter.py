@@ -29,14 +29,12 @@ class Matter:
         """(N,) a quarter of each adjoining tetrahedron."""
         tets = body.tetrahedra
         quarter = tet_volumes(body.nodes, tets) * np.tile(self.density, 6) / 4
-        masses: Array = np.bincount(tets.ravel(), np.repeat(quarter, 4), len(body.nodes)).astype(float)
-        return masses
+        return np.bincount(tets.ravel(), np.repeat(quarter, 4), len(body.nodes)).astype(float)
 
     def node_drag(self, body: Body) -> Array:
         """(N,) mean of the adjoining cells [1/s]."""
         corners = body.cells.ravel()
-        drag: Array = np.bincount(corners, np.repeat(self.drag, 8)) / np.bincount(corners)
-        return drag
+        return np.bincount(corners, np.repeat(self.drag, 8)) / np.bincount(corners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,5 +113,4 @@ def _stiffness(body: Body, matter: Matter) -> coo_array:
     index = 3 * tets[:, :, None] + np.arange(3)  # (T, 4, 3)
     rows = np.broadcast_to(index[:, :, None, :, None], block.shape)
     columns = np.broadcast_to(index[:, None, :, None, :], block.shape)
-    matrix = coo_array((block.ravel(), (rows.ravel(), columns.ravel())), shape=(body.nodes.size,) * 2)
-    return matrix.tocsr()
+    return coo_array((block.ravel(), (rows.ravel(), columns.ravel())), shape=(body.nodes.size,) * 2).tocsr()

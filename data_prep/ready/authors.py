@@ -1,10 +1,13 @@
-"""The layout of READY's authors: which files there are, which sequences count, whose cameras they have."""
+"""The layout of READY's authors: which files there are, which sequences count, whose cameras they have, what is marked.
+
+PhysDreamer's folders have the same scene: a point cloud of Gaussians, clouds and a list that mark parts of it.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ import numpy as np
 
 from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import list_images, natural, open_photo
-from gausim.core.errors import DataError
+from gausim.core.errors import DataError, SceneError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
 from gausim.io.plain_json import checked, read_any_json, read_json
 
@@ -73,10 +76,6 @@ class ReadyFiles:
     left_out: dict[str, str]  # sequences that are not used, and why
     masks: dict[str, Path | None]  # folders of masks, of ``images`` and of ``video_images``, where there are some
 
-    def part(self, name: str) -> Path | None:
-        """A file of the scene, such as :data:`SCENE`, where there is one."""
-        return self.root / name if (self.root / name).is_file() else None
-
     def mask(self, path: Path) -> Path | None:
         """The mask of a still or a frame: the same path with the ending of any image, or with ``.png`` appended.
 
@@ -95,18 +94,15 @@ class ReadyFiles:
     def inputs(self) -> dict[str, Path]:
         """Everything that is read, by name."""
         model = {f"sparse/{role}": path for role, path in colmap_files(self.model.path).items()}
-        parts = {name: self.part(name) for name in (SCENE, MOVING, OBJECT, PINS)}
-        files = {**model, "meta.json": self.root / "meta.json", **parts}
-        for path in self._images():
+        files = {**model, "meta.json": self.root / "meta.json", **scene_files(self.root)}
+        folders = [folder for cameras in self.frames.values() for folder in cameras.values()]
+        images = [shot.photo.path for shot in self.stills]
+        for path in chain(images, *map(list_images, folders)):
             name = str(path.relative_to(self.root))
-            files |= {name: path, f"mask of {name}": self.mask(path)}
-        return {name: path for name, path in files.items() if path is not None}
-
-    def _images(self) -> Iterator[Path]:
-        yield from (shot.photo.path for shot in self.stills)
-        for cameras in self.frames.values():
-            for folder in cameras.values():
-                yield from list_images(folder)
+            files[name] = path
+            if (mask := self.mask(path)) is not None:
+                files[f"mask of {name}"] = mask
+        return files
 
 
 def find_files(root: Path, image_masks: Path | None = None, video_masks: Path | None = None) -> ReadyFiles:
@@ -210,3 +206,52 @@ def read_pins(path: Path, count: int) -> np.ndarray:
     pins = np.zeros(count, bool)
     pins[data] = True
     return pins
+
+
+def scene_files(root: Path) -> dict[str, Path]:
+    """The files of the scene that are there, by name."""
+    return {name: root / name for name in (SCENE, MOVING, OBJECT, PINS) if (root / name).is_file()}
+
+
+def write_scene(work: Path, root: Path, near: float, *, anchor: float | None = None) -> dict[str, int] | None:
+    """Writes ``scene.ply`` with its masks, where there is a point cloud, and returns how many kernels they mark.
+
+    Args:
+        work: the folder to write to.
+        root: the folder with the clouds.
+        near: kernels so close to the moving cloud are simulated, to the object's cloud foreground [scene units].
+        anchor: kernels of the object that do not move, but are so close to what moves, are simulated and pinned
+            [scene units]; None: the pins are those of the list.
+
+    Raises:
+        SceneError: the point cloud is no 3DGS scene, or a mask marks nothing.
+        DataError: a cloud or the list is malformed.
+    """
+    import torch
+
+    from data_prep.ready.selections import read_points
+    from gausim.io.ply import load_scene, save_scene
+    from gausim.ops.selection import NearPoints, apply_masks
+
+    files = scene_files(root)
+    if SCENE not in files:
+        return None
+    scene = load_scene(files[SCENE], name="scene")
+    masks: dict[str, Any] = {}
+    for mask, cloud in (("simulated", MOVING), ("foreground", OBJECT)):
+        if cloud in files:
+            masks[mask] = NearPoints(torch.from_numpy(read_points(files[cloud])), near)(scene)
+    if anchor is not None and "simulated" in masks and masks["simulated"].any():
+        moving = NearPoints(scene.means[masks["simulated"]], anchor)(scene)
+        masks["pinned"] = moving & masks.get("foreground", torch.ones_like(moving)) & ~masks["simulated"]
+        if not masks["pinned"].any():
+            raise SceneError(
+                f"{files[MOVING]}: no kernel of the object is within {anchor:g} of the moving ones without being one. "
+                "Give a larger --anchor, or mark the pins with `select`."
+            )
+        masks["simulated"] = masks["simulated"] | masks["pinned"]
+    elif PINS in files:
+        masks["pinned"] = torch.from_numpy(read_pins(files[PINS], scene.count))
+    scene = apply_masks(scene, **masks)
+    save_scene(scene, work / "scene.ply")
+    return {"kernels": scene.count} | {n: int(getattr(scene, n).sum()) for n in ("simulated", "pinned", "foreground")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,20 +29,18 @@ FORMS = {
     "mask": "mask simulated|pinned|foreground",
 }
 GRAMMAR = "TERM [and|or] [not] TERM ..., a TERM being " + "; ".join(FORMS.values())
-_JOINTS = ("and", "or", "not")
 # Point sets above this would take hours against a scene.
 _MOST_POINTS = 5_000_000
 
 
+@dataclass(frozen=True)
 class _Mask(Selection):
     """A mask that the scene has already."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    name: str
 
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
-        mask: Tensor = getattr(scene, self.name)
-        return mask
+        return getattr(scene, self.name)
 
 
 def parse_selection(text: str) -> tuple[Selection, list[Path]]:
@@ -60,29 +59,26 @@ def parse_selection(text: str) -> tuple[Selection, list[Path]]:
         words = shlex.split(text)
     except ValueError as error:
         raise SceneError(f"selection '{text}': {error}.") from error
+    terms: list[tuple[str, list[str]]] = [("and", [])]
+    for word in words:
+        if word in ("and", "or"):
+            terms.append((word, []))
+        elif word == "not" and set(terms[-1][1]) - {"not"}:
+            raise _wrong(text, "'not' where 'and' or 'or' should stand")
+        else:
+            terms[-1][1].append(word)
+    chosen: Selection = HalfSpace(0)  # all
     files: list[Path] = []
-    chosen: Selection | None = None
-    while words:
-        joint = "and"
-        if chosen is not None:
-            joint = words.pop(0)
-            if joint not in ("and", "or"):
-                raise _wrong(text, f"'{joint}' where 'and' or 'or' should stand")
+    for joint, rest in terms:
         negate = False
-        while words and words[0] == "not":
-            negate = not negate
-            words.pop(0)
-        end = next((i for i, word in enumerate(words) if word in _JOINTS), len(words))
-        if not words or not end:
-            break
-        term = _term(words[:end], text, files)
+        while rest[:1] == ["not"]:
+            negate, rest = not negate, rest[1:]
+        if not rest:
+            raise _wrong(text, "a term is missing")
+        term = _term(rest, text, files)
         term = ~term if negate else term
-        chosen = term if chosen is None else (chosen & term if joint == "and" else chosen | term)
-        words = words[end:]
-    else:
-        if chosen is not None:
-            return chosen, files
-    raise _wrong(text, "a term is missing")
+        chosen = chosen & term if joint == "and" else chosen | term
+    return chosen, files
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -99,7 +95,11 @@ def read_points(path: Path) -> np.ndarray:
     elif path.suffix.lower() == ".npz":
         points = read_array(path, "points")
     else:
-        points = _text_points(path)
+        try:
+            rows = [line.split() for line in path.read_text("utf-8").replace(",", " ").splitlines()]
+            points = np.array([[float(word) for word in row] for row in rows if row and row[0][0] != "#"])
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: expected three numbers per line ({error!s:.80}).") from error
     numeric = points.dtype.kind in "fiu"
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points) or not numeric or len(points) > _MOST_POINTS:
         raise DataError(
@@ -109,15 +109,6 @@ def read_points(path: Path) -> np.ndarray:
     if not np.isfinite(points).all() or np.abs(points).max() > 1e30:
         raise DataError(f"{path}: field 'points' holds NaN or infinite numbers. Export it again.")
     return points.astype(np.float32)
-
-
-def _text_points(path: Path) -> np.ndarray:
-    try:
-        lines = path.read_text("utf-8").replace(",", " ").splitlines()
-        rows = [[float(word) for word in line.split()] for line in lines if line.strip() and line.strip()[0] != "#"]
-        return np.array(rows)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: expected three numbers per line ({error!s:.80}).") from error
 
 
 def _term(words: list[str], text: str, files: list[Path]) -> Selection:

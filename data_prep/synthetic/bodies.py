@@ -24,8 +24,7 @@ _PATHS = ((4, 2, 1), (4, 1, 2), (2, 4, 1), (2, 1, 4), (1, 4, 2), (1, 2, 4))
 def tet_volumes(nodes: Array, tetrahedra: Ints) -> Array:
     """Signed volumes (..., T) of tetrahedra (T, 4) of nodes (..., N, 3)."""
     x = nodes[..., tetrahedra, :]
-    volumes: Array = np.linalg.det(x[..., 1:, :] - x[..., :1, :]) / 6
-    return volumes
+    return np.linalg.det(x[..., 1:, :] - x[..., :1, :]) / 6
 
 
 @dataclass(frozen=True, eq=False)

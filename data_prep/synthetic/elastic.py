@@ -38,7 +38,9 @@ class ElasticBody:
         self._model = mujoco.MjModel.from_xml_string(_model_xml(body, material, viscosity, floor, driven=driven))
         self.substeps = int(np.ceil(1 / (fps * time_step)))
         self._model.opt.timestep = 1 / fps / self.substeps
-        self._held = np.flatnonzero(body.held)
+        parts = self._model.flex_vertbodyid
+        self._held, self._free = np.flatnonzero(body.held), np.flatnonzero(self._model.body_dofnum[parts] == 3)
+        self._dofs = self._model.body_dofadr[parts][:, None] + np.arange(3)  # (N, 3) degrees of freedom
         # The integrator treats this damping implicitly, so it is stable at any rate.
         self._model.dof_damping[:] = material.drag * material.mass / len(body.nodes)
         self._data = mujoco.MjData(self._model)
@@ -55,13 +57,10 @@ class ElasticBody:
             masses: of the nodes (N,).
             drag: of the nodes (N,), force over momentum [1/s].
         """
-        model = self._model
+        model, free = self._model, self._free
         model.flex_stiffness.reshape(len(young_modulus), -1)[:] *= young_modulus[:, None]
-        for node, part in enumerate(model.flex_vertbodyid):
-            if model.body_dofnum[part] == 3:
-                first = model.body_dofadr[part]
-                model.body_mass[part] = masses[node]
-                model.dof_damping[first : first + 3] = drag[node] * masses[node]
+        model.body_mass[model.flex_vertbodyid[free]] = masses[free]
+        model.dof_damping[self._dofs[free]] = (drag * masses)[free, None]
         mujoco.mj_setConst(model, self._data)
 
     def simulate(self, velocity: Array, frames: int, *, shift: Array | None = None, path: Array | None = None) -> Array:
@@ -77,16 +76,12 @@ class ElasticBody:
         Raises:
             DivergenceError: MuJoCo warned (it resets silently on NaN) or a position is not finite.
         """
-        model, data = self._model, self._data
+        model, data, free = self._model, self._data, self._dofs[self._free]
         mujoco.mj_resetData(model, data)
         # Half a kick of gravity back: then the semi-implicit steps fall on the parabola itself.
-        kick = 0.5 * model.opt.timestep * model.opt.gravity
-        for node, part in enumerate(model.flex_vertbodyid):
-            if model.body_dofnum[part] == 3:
-                first = model.body_dofadr[part]
-                data.qvel[first : first + 3] = velocity[node] - kick
-                if shift is not None:
-                    data.qpos[first : first + 3] = shift
+        data.qvel[free] = velocity[self._free] - 0.5 * model.opt.timestep * model.opt.gravity
+        if shift is not None:
+            data.qpos[free] = shift
         positions, messages = [self.rest if shift is None else self.rest + shift], list[str]()
         default = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(messages.append)  # by default MuJoCo writes a log file where one stands
@@ -113,15 +108,13 @@ class ElasticBody:
         if path is None:
             mujoco.mj_step(model, data, nstep=self.substeps)
             return
-        first = model.body_dofadr[model.flex_vertbodyid[self._held]]
-        places = (first[:, None] + np.arange(3)).ravel()
-        rest = self.rest[self._held]
+        held, rest = self._dofs[self._held], self.rest[self._held]
         start, stop = (frame - 1) * self.substeps, frame * self.substeps
         for step in range(start, stop):
-            data.qpos[places] = (path[step] - rest).ravel()
-            data.qvel[places] = (path[step + 1] - path[step]).ravel() / model.opt.timestep
+            data.qpos[held] = path[step] - rest
+            data.qvel[held] = (path[step + 1] - path[step]) / model.opt.timestep
             mujoco.mj_step(model, data)
-        data.qpos[places] = (path[stop] - rest).ravel()
+        data.qpos[held] = path[stop] - rest
 
 
 def _model_xml(body: Body, material: Material, viscosity: float | None, floor: Floor | None, *, driven: bool) -> str:

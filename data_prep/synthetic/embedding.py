@@ -116,17 +116,12 @@ def embedded_scene(points: Embedding, frames: Array, spacing: float, colors: Arr
 
 def _outer_faces(body: Body) -> tuple[Ints, Ints, Array]:
     """Cell, axis and side (0 or 1) of every cell face without a neighbour."""
-    present = {tuple(g) for g in body.grid.tolist()}
-    faces = []
-    for number, grid in enumerate(body.grid.tolist()):
-        for axis in range(3):
-            for side in (0, 1):
-                beside = list(grid)
-                beside[axis] += 2 * side - 1
-                if tuple(beside) not in present:
-                    faces.append((number, axis, side))
-    cell, axis_of, side_of = np.array(faces).T
-    return cell, axis_of, side_of.astype(float)
+    place = body.grid - body.grid.min(0) + 1
+    solid = np.zeros(place.max(0) + 2, bool)
+    solid[tuple(place.T)] = True
+    beside = place[:, None, None] + np.eye(3, dtype=int)[:, None] * np.array([[-1], [1]])  # (C, axis, side, 3)
+    cell, axis, side = np.nonzero(~solid[tuple(np.moveaxis(beside, -1, 0))])
+    return cell, axis, side.astype(float)
 
 
 def _area_vector(points: Embedding, axis: Ints, side: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from data_prep.synthetic.bodies import Array, Body, Ints
+from data_prep.synthetic.bodies import Array, Body
 
 # Amplitudes of the six motions of the two hands, of which a kind weights some [scene units, radian].
 APART, ASIDE, TURN, TWIST, CIRCLE = 0.13, 0.3, 0.45, 0.9, 0.26
@@ -52,14 +52,10 @@ def _pairs(values: Array) -> tuple[tuple[float, float], ...]:
     return tuple((a, b) for a, b in values.round(6).tolist())
 
 
-def hand_of_node(body: Body) -> Ints:
-    """(H,) the hand, 0 or 1, of every held node."""
-    return (body.nodes[body.held, 0] > 0).astype(np.int64)
-
-
 def held_path(body: Body, path: HandPath, times: Array) -> Array:
     """Positions (T, H, 3) of the held nodes at ``times`` [s]; they move rigidly with their hand."""
-    nodes, hand = body.nodes[body.held], hand_of_node(body)
+    nodes = body.nodes[body.held]
+    hand = nodes[:, 0] > 0
     result = np.empty((len(times), *nodes.shape))
     for number in (0, 1):
         own = nodes[hand == number]

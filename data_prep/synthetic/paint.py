@@ -11,16 +11,28 @@ from data_prep.synthetic.bodies import Array, Ints
 LIGHT = np.array([0.4, -0.5, 0.77])
 
 
-def paint_pudding(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
-    """Custard below, caramel on top, with cherries: RGB (K, 3) at points ``x``."""
+def paint(body: str, x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
+    """RGB (K, 3) of a kind of body at points ``x`` in cells ``grid``."""
+    painter, count, radius = PAINTERS[body]
+    color = painter(x, grid)
+    for center in x[rng.choice(len(x), count, replace=False)]:
+        weight = np.exp(-((((x - center) ** 2).sum(1) / radius**2) ** 2))[:, None]
+        color = (1 - weight) * color + weight * rng.uniform(0.05, 0.95, 3)
+    # Half-Lambert light from above, part of the colour as in a 3DGS capture.
+    light = LIGHT / np.linalg.norm(LIGHT)
+    return np.clip(color * (0.62 + 0.38 * (0.5 + 0.5 * normal @ light))[:, None], 0.02, 0.98)
+
+
+def _pudding(x: Array, grid: Ints) -> Array:
+    """Custard below, caramel on top, with cherries."""
     height = (x[:, 2] - x[:, 2].min()) / np.ptp(x[:, 2])
     custard, caramel = np.array([0.95, 0.82, 0.5]), np.array([0.55, 0.27, 0.1])
-    top = 1 / (1 + np.exp(-14 * (height - 0.72 - 0.08 * np.sin(4 * np.arctan2(x[:, 1], x[:, 0])))))
-    return _shade(_spots((1 - top)[:, None] * custard + top[:, None] * caramel, x, 26, 0.075, rng), normal)
+    top = 1 / (1 + np.exp(-14 * (height - 0.72 - 0.08 * np.sin(4 * np.arctan2(x[:, 1], x[:, 0])))))[:, None]
+    return (1 - top) * custard + top * caramel
 
 
-def paint_flower(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
-    """Green stem and leaf, pink petals around a yellow heart: RGB (K, 3) at points ``x`` in cells ``grid``."""
+def _flower(x: Array, grid: Ints) -> Array:
+    """Green stem and leaf, pink petals around a yellow heart."""
     color = np.tile([0.3, 0.58, 0.22], (len(x), 1))
     color[grid[:, 0] > 2] = [0.16, 0.45, 0.2]
     blossom = grid[:, 2] == grid[:, 2].max()
@@ -29,41 +41,27 @@ def paint_flower(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) 
     petal = np.array([0.93, 0.4, 0.6]) * (1 - 0.35 * radius[:, None]) + [0.05, 0.0, 0.12]
     heart = np.exp(-((radius / 0.38) ** 4))[:, None]
     color[blossom] = (heart * [0.98, 0.8, 0.2] + (1 - heart) * petal)[blossom]
-    return _shade(_spots(color, x, 22, 0.06, rng), normal)
-
-
-def paint_jelly(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
-    """Raspberry on one side, mint on the other, with fruits: RGB (K, 3) at points ``x``."""
-    side = (x - x.min(0)) / np.ptp(x, axis=0) @ np.array([0.5, 0.2, 0.3])
-    mint = 1 / (1 + np.exp(-12 * (side - 0.5 - 0.06 * np.sin(9 * x[:, 1]))))[:, None]
-    return _shade(_spots((1 - mint) * [0.85, 0.2, 0.35] + mint * [0.35, 0.8, 0.6], x, 60, 0.1, rng), normal)
-
-
-def paint_bar(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
-    """Bands along the bar from blue to orange, with spots: RGB (K, 3) at points ``x``."""
-    along = ((x[:, 0] - x[:, 0].min()) / np.ptp(x[:, 0]))[:, None]
-    band = 0.75 + 0.25 * np.sin(40 * along)
-    color = band * ((1 - along) * [0.2, 0.35, 0.85] + along * [0.95, 0.55, 0.15])
-    return _shade(_spots(color, x, 40, 0.055, rng), normal)
-
-
-PAINTERS: dict[str, Callable[[Array, Array, Ints, np.random.Generator], Array]] = {
-    "pudding": paint_pudding,
-    "flower": paint_flower,
-    "jelly": paint_jelly,
-    "bar": paint_bar,
-}
-
-
-def _spots(color: Array, x: Array, count: int, radius: float, rng: np.random.Generator) -> Array:
-    """Dabs of random colours around random points."""
-    for center in x[rng.choice(len(x), count, replace=False)]:
-        weight = np.exp(-((((x - center) ** 2).sum(1) / radius**2) ** 2))[:, None]
-        color = (1 - weight) * color + weight * rng.uniform(0.05, 0.95, 3)
     return color
 
 
-def _shade(color: Array, normal: Array) -> Array:
-    """Half-Lambert light from above, part of the colour as in a 3DGS capture."""
-    light = LIGHT / np.linalg.norm(LIGHT)
-    return np.clip(color * (0.62 + 0.38 * (0.5 + 0.5 * normal @ light))[:, None], 0.02, 0.98)
+def _jelly(x: Array, grid: Ints) -> Array:
+    """Raspberry on one side, mint on the other, with fruits."""
+    side = (x - x.min(0)) / np.ptp(x, axis=0) @ np.array([0.5, 0.2, 0.3])
+    mint = 1 / (1 + np.exp(-12 * (side - 0.5 - 0.06 * np.sin(9 * x[:, 1]))))[:, None]
+    return (1 - mint) * [0.85, 0.2, 0.35] + mint * [0.35, 0.8, 0.6]
+
+
+def _bar(x: Array, grid: Ints) -> Array:
+    """Bands along the bar from blue to orange."""
+    along = ((x[:, 0] - x[:, 0].min()) / np.ptp(x[:, 0]))[:, None]
+    band = 0.75 + 0.25 * np.sin(40 * along)
+    return band * ((1 - along) * [0.2, 0.35, 0.85] + along * [0.95, 0.55, 0.15])
+
+
+# Of each body its colours, and how many dabs of random colours it has, of which radius [scene units].
+PAINTERS: dict[str, tuple[Callable[[Array, Ints], Array], int, float]] = {
+    "pudding": (_pudding, 26, 0.075),
+    "flower": (_flower, 22, 0.06),
+    "jelly": (_jelly, 60, 0.1),
+    "bar": (_bar, 40, 0.055),
+}

@@ -8,7 +8,6 @@ from data_prep.common.command import Options, names, option
 from gausim.core.errors import ConfigError
 
 TRAIN_FRAMES = 16  # frames 0..15 are seen, as the paper trains
-MOST_TRAIN_VIEWS = 4
 # Amplitudes of a push that stays nearly linear, and of one that bends a body far beyond [diagonals].
 SMALL_SWING, LARGE_SWING = (0.05, 0.08), (0.18, 0.28)
 LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
@@ -105,13 +104,11 @@ class Plan(Options):
     seed: int = option(0, "of everything random (0)")
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
+        """Checks the numbers and the names."""
         super().__post_init__()
         unknown = [name for name in self.objects if name not in RECIPES]
         if unknown or not self.objects:
             raise ConfigError(f"objects: no recipe for {unknown}; choose some of {', '.join(RECIPES)}.")
-        if not 1 <= self.train_views <= MOST_TRAIN_VIEWS:
-            raise ConfigError(f"train_views: expected 1..{MOST_TRAIN_VIEWS}, got {self.train_views}.")
 
     @property
     def views(self) -> tuple[str, ...]:

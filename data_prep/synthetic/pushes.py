@@ -1,4 +1,4 @@
-"""Random pushes that start the sequences: pokes (local) and drags (wide), velocities scaled to an amplitude."""
+"""What starts the sequences at random: falls; pokes (local) and drags (wide), velocities scaled to an amplitude."""
 
 from __future__ import annotations
 
@@ -21,6 +21,10 @@ TOLERANCE = 0.05
 WHOLE, HALF = 6, 6
 # Pushes that are drawn at most until one turns no finite element inside out.
 DRAWS = 50
+# Of a fall: the largest shift of its start from the rest state, up or down and sideways [scene units], and the largest
+# speeds [scene units / s], [scene units / s] and [radian / s].
+HIGHER, ASIDE = 0.12, 0.1
+SIDEWAYS, UPWARDS, SPIN = 0.2, 0.3, 0.25
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,15 @@ class Push:
     point: tuple[float, float, float]  # where [scene units]
     direction: tuple[float, float, float]  # where to, unit length
     amplitude: float  # largest displacement that it causes, as a fraction of the body's diagonal
+
+
+@dataclass(frozen=True)
+class Fall:
+    """One fall, from the undeformed and upright body on."""
+
+    shift: tuple[float, float, float]  # of the body in frame 0 from its rest state [scene units]
+    velocity: tuple[float, float, float]  # of its centre of mass in frame 0 [scene units / s]
+    spin: tuple[float, float, float]  # angular velocity in frame 0 [radian / s]
 
 
 def random_motion(
@@ -103,3 +116,16 @@ def _peak(body: Body, elastic: ElasticBody, velocity: Array) -> float:
     """Largest displacement within the first swing [diagonals]."""
     swing = elastic.simulate(velocity, FIRST_SWING)
     return float(np.linalg.norm(swing - body.nodes, axis=-1).max() / body.diagonal)
+
+
+def random_fall(rng: np.random.Generator) -> Fall:
+    """A fall that lands within a few frames of the others."""
+    shift = rng.uniform(-1, 1, 3) * [ASIDE, ASIDE, HIGHER]
+    velocity = rng.uniform(-1, 1, 3) * [SIDEWAYS, SIDEWAYS, UPWARDS]
+    spin = rng.uniform(-1, 1, 3) * SPIN
+    return Fall(*(tuple(x.round(6).tolist()) for x in (shift, velocity, spin)))
+
+
+def fall_field(body: Body, fall: Fall) -> Array:
+    """Velocity (N, 3) of the nodes in frame 0 [scene units / s]."""
+    return np.array(fall.velocity) + np.cross(fall.spin, body.nodes - body.nodes.mean(0))

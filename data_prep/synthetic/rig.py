@@ -12,7 +12,7 @@ from torch import Tensor
 from data_prep.common.spread import dome
 from data_prep.synthetic.bodies import Array
 from gausim.core import Cameras, GaussianScene
-from gausim.render.draw import draw
+from gausim.render.draw import draw, to_bytes
 from gausim.render.reference import ReferenceRenderer
 
 FIELD_OF_VIEW = math.radians(40.0)
@@ -62,15 +62,8 @@ def photograph(
     """
     u, _, vt = np.linalg.svd(gradients)
     with torch.inference_mode():
-        drawn = draw(
-            ReferenceRenderer(),
-            scene,
-            torch.from_numpy(positions).float(),
-            torch.from_numpy(gradients).float(),
-            torch.from_numpy(u @ vt).float(),
-            torch.arange(scene.count),
-            cameras,
-        )
+        means, deformed, turned = (torch.from_numpy(part).float() for part in (positions, gradients, u @ vt))
+        drawn = draw(ReferenceRenderer(), scene, means, deformed, turned, torch.arange(scene.count), cameras)
         alpha = drawn.alpha.clamp(0, 1)[..., None]
         rgb = torch.where(alpha > 0.5 / 255, drawn.rgb / alpha.clamp_min(0.5 / 255), 0.0)
-        return (torch.cat((rgb, alpha), -1).clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        return to_bytes(torch.cat((rgb, alpha), -1))

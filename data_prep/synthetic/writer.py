@@ -12,11 +12,10 @@ import numpy as np
 from data_prep.synthetic.bodies import BODIES, Array, Body
 from data_prep.synthetic.elastic import ElasticBody
 from data_prep.synthetic.embedding import Embedding, cover_surface, embedded_scene
-from data_prep.synthetic.falls import fall_field, random_fall
 from data_prep.synthetic.hands import grip, held_path, random_path
-from data_prep.synthetic.paint import PAINTERS
+from data_prep.synthetic.paint import paint
 from data_prep.synthetic.plan import RECIPES, TRAIN_FRAMES, Plan
-from data_prep.synthetic.pushes import random_motion
+from data_prep.synthetic.pushes import fall_field, random_fall, random_motion
 from data_prep.synthetic.rig import photograph, still_cameras, video_cameras
 from gausim.core import Cameras, GaussianScene
 from gausim.data.images import write_rgba
@@ -37,15 +36,11 @@ class SyntheticObject:
         points, frames, spacing = cover_surface(self.body, plan.kernels, rng)
         self.points: Embedding = points
         rest = points.positions(self.body.nodes)
-        colors = PAINTERS[self.recipe.body](rest, frames[..., 2], self.body.grid[points.cell], rng)
+        colors = paint(self.recipe.body, rest, frames[..., 2], self.body.grid[points.cell], rng)
         self.scene: GaussianScene = embedded_scene(points, frames, spacing, colors, name=self.name)
         low, high = self.body.nodes.min(0), self.body.nodes.max(0)
         self.center, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
         self.room = self.recipe.room or (self.center, self.radius)
-
-    @property
-    def _swing(self) -> tuple[float, float]:
-        return self.recipe.swing if self.plan.swing is None else self.plan.swing
 
     @cached_property
     def elastic(self) -> ElasticBody:
@@ -114,7 +109,7 @@ class SyntheticObject:
             held = held_path(body, path, times)
             return self.elastic.simulate(np.zeros_like(body.nodes), frames, path=held), asdict(path)
         kind, rng = ("poke", "drag")[number % 2], self._rng("push", number)
-        push, motion = random_motion(body, self.elastic, kind, rng, self._swing, frames)
+        push, motion = random_motion(body, self.elastic, kind, rng, self.plan.swing or recipe.swing, frames)
         return motion, asdict(push)
 
     def _photograph(self, displacement: Array, cameras: Cameras) -> np.ndarray:
@@ -126,7 +121,7 @@ class SyntheticObject:
     def _facts(self) -> dict[str, object]:
         plan, recipe = self.plan, self.recipe
         gravity = 0.0 if recipe.floor is None else recipe.floor.gravity
-        return {
+        facts: dict[str, object] = {
             "name": self.name,
             "fps": plan.fps,
             "frames": plan.frames,
@@ -142,18 +137,13 @@ class SyntheticObject:
             "alpha": "straight; foreground mask = alpha; composite as rgb * alpha",
             "seed": plan.seed,
             "simulation": {"method": "MuJoCo flex, linear tetrahedra", "gravity": gravity, **recipe.facts},
-            **self._surroundings(),
         }
-
-    def _surroundings(self) -> dict[str, object]:
-        """The entries of ``dataset.json`` on gravity, floor and hands, where there are any."""
-        recipe = self.recipe
         if recipe.floor is not None:
             floor = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": recipe.floor.friction}
-            return {"free": True, "gravity": [0.0, 0.0, -recipe.floor.gravity], "floor": floor}
-        if recipe.hands is None:
-            return {}
-        return {"grip": grip(self.scene.means.numpy(), self.scene.pinned.numpy())}
+            facts |= {"free": True, "gravity": [0.0, 0.0, -gravity], "floor": floor}
+        if recipe.hands is not None:
+            facts["grip"] = grip(self.scene.means.numpy(), self.scene.pinned.numpy())
+        return facts
 
     def _figures(self, displacement: np.ndarray) -> dict[str, object]:
         length = np.linalg.norm(displacement, axis=-1)

@@ -2,43 +2,31 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
+from functools import cache
+from typing import Any
 
 import pytest
 from helpers import public_sets
-from helpers.public_sets import Sample
+
+WRITERS: dict[str, tuple[Callable[..., Any], str]] = {
+    "springgaus": (public_sets.write_springgaus, "render/torus"),
+    "real": (public_sets.write_springgaus_real, "real_capture"),
+    "pacnerf": (public_sets.write_pacnerf, "data/bird"),
+    "phystwin": (public_sets.write_phystwin, "different_types/double_stretch_sloth"),
+    "genesis": (public_sets.write_3dgsim, "genesis/dog"),
+    "physdreamer": (public_sets.write_physdreamer, "physics_dreamer/hat"),
+}
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("public")
+def sample_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
+    """The sample of a public set by its name, and the truth about it."""
+    folder = tmp_path_factory.mktemp("public")
 
+    @cache
+    def written(name: str) -> Any:
+        write, place = WRITERS[name]
+        return write(folder / place)
 
-@pytest.fixture(scope="session")
-def springgaus(folder: Path) -> Sample:
-    return public_sets.write_springgaus(folder / "render" / "torus")
-
-
-@pytest.fixture(scope="session")
-def real(folder: Path) -> Sample:
-    return public_sets.write_springgaus_real(folder / "real_capture")
-
-
-@pytest.fixture(scope="session")
-def pacnerf(folder: Path) -> Sample:
-    return public_sets.write_pacnerf(folder / "data" / "bird")
-
-
-@pytest.fixture(scope="session")
-def phystwin(folder: Path) -> Sample:
-    return public_sets.write_phystwin(folder / "different_types" / "double_stretch_sloth")
-
-
-@pytest.fixture(scope="session")
-def genesis(folder: Path) -> Sample:
-    return public_sets.write_3dgsim(folder / "genesis" / "dog")
-
-
-@pytest.fixture(scope="session")
-def physdreamer(folder: Path) -> Path:
-    return public_sets.write_physdreamer(folder / "physics_dreamer" / "hat").root
+    return written

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.plain import contents
 from scipy import ndimage
 
@@ -68,16 +69,9 @@ def test_bodies_are_sound(kind: str) -> None:
 def test_a_mesh_is_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A torus of known volume, its faces turned inwards."""
     monkeypatch.setattr(shapes, "SAMPLES", 24)
-    count, turns = 48, np.linspace(0, 2 * np.pi, 48, endpoint=False)
-    u, v = (t.ravel() for t in np.meshgrid(turns, turns, indexing="ij"))
-    ring = 1 + 0.4 * np.cos(v)
-    points = np.stack((ring * np.cos(u), ring * np.sin(u), 0.4 * np.sin(v)), 1)
-    i, j = (t.ravel() for t in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
-    a, b = i * count + j, (i + 1) % count * count + j
-    c, d = (i + 1) % count * count + (j + 1) % count, i * count + (j + 1) % count
-    rows = [f"v {x} {y} {z}" for x, y, z in points.tolist()]
-    rows += [f"f {p + 1} {s + 1} {r + 1} {q + 1}" for p, q, r, s in zip(a, b, c, d, strict=True)]
-    (tmp_path / "torus.obj").write_text("\n".join(rows))
+    torus = trimesh.creation.torus(1.0, 0.4, major_sections=48, minor_sections=48)
+    torus.invert()
+    torus.export(tmp_path / "torus.obj")
     body = body_of(from_mesh(tmp_path / "torus.obj"), 250)
     assert body is not None
     volume = tet_volumes(body.nodes, body.tetrahedra).sum() * (1.4 / 0.95) ** 3
@@ -111,22 +105,16 @@ def test_mujoco_swings_at_the_frequency_of_the_uneven_body() -> None:
 def test_material_points_swing_nearly_as_fine_elements_do() -> None:
     """Three cells wide, which is the least: 27 % slower; the corpus chooses their modulus from the period measured."""
     body, fine = beam(6, 3), beam(12, 6)
-    period, modes = period_of(replace(fine, nodes=fine.nodes / 2))[0], period_of(body)[1]
-    mover = MaterialPoints(middles(body), block_matter(body), fps=20 / period)
+    fine = replace(fine, nodes=fine.nodes / 2)
+    modes, finer = (modes_of(one, matter_of(one, 100.0, 0.3), 2) for one in (body, fine))
+    period = 2 * np.pi / finer.omega[0]
+    matter = replace(matter_of(body, 100.0, 0.3), drag=np.full(len(body.cells), 1e-6))
+    mover = MaterialPoints(middles(body), matter, fps=20 / period)
     found = mover.period_of(modes.shapes[0], period, 0.1)
     velocity = modes.shapes[0] / np.abs(modes.shapes[0]).max() * 0.1 * modes.omega[0]
     x, _ = mover.simulate(velocity, 32)
     assert measured_period(body, modes, x, 20 / period) == pytest.approx(found, rel=0.03)
     assert found == pytest.approx(period, rel=0.35)
-
-
-def block_matter(body: Body) -> Matter:
-    return replace(matter_of(body, 100.0, 0.3), drag=np.full(len(body.cells), 1e-6))
-
-
-def period_of(body: Body) -> tuple[float, Modes]:
-    modes = modes_of(body, block_matter(body), 2)
-    return 2 * np.pi / modes.omega[0], modes
 
 
 def test_interrupted_corpus_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

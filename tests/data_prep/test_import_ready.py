@@ -23,7 +23,6 @@ from gausim.data.records import read_stills
 from gausim.io.ply import load_scene, save_scene
 from gausim.io.transforms import read_transforms
 
-tests = Path(__file__).parents[1]
 SIZE = 32, 24
 FRAMES = 3
 OPTIONS = ReadyOptions(train_frames=2)

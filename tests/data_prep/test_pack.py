@@ -101,12 +101,6 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
 }
 
 
-def _flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 255
-    path.write_bytes(data)
-
-
 def _cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
@@ -121,7 +115,9 @@ def test_every_fault_is_named(store: Path, name: str) -> None:
 
 
 def test_all_faults_at_once(store: Path) -> None:
-    _flip(store / "sequences" / "seq_000" / PIXELS)
+    pixels = store / "sequences" / "seq_000" / PIXELS
+    data = pixels.read_bytes()
+    pixels.write_bytes(data[:-1] + bytes([data[-1] ^ 255]))
     (store / "sequences" / "seq_001" / HEADER).unlink()
     (store / "scene.masks.npz").write_bytes(b"nothing")
     places = {fault.where for fault in verify(store)}

@@ -7,6 +7,8 @@ import os
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,11 @@ import numpy as np
 import pytest
 from helpers.plain import Call
 
-from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
-from data_prep.import_3dgsim import GenesisOptions
-from data_prep.import_pacnerf import PacNerfOptions
-from data_prep.import_physdreamer import PhysDreamerOptions
-from data_prep.import_phystwin import PhysTwinOptions
-from data_prep.import_springgaus import SpringGausOptions
+from data_prep.import_3dgsim import GenesisOptions, import_3dgsim
+from data_prep.import_pacnerf import PacNerfOptions, import_pacnerf
+from data_prep.import_physdreamer import PhysDreamerOptions, import_physdreamer
+from data_prep.import_phystwin import PhysTwinOptions, import_phystwin
+from data_prep.import_springgaus import SpringGausOptions, import_springgaus
 from gausim.core import GausSimError
 
 
@@ -34,27 +35,21 @@ class Damage:
     named: str | None = None  # the file in the message, where it is not this one
 
 
-def at(data: Any, keys: tuple[Any, ...]) -> Any:
-    for key in keys:
-        data = data[key]
-    return data
-
-
 def put(*keys: Any, to: Any) -> Callable[[Any], Any]:
+    """Replaces what stands in a place, or computes it from what stands there; None takes it out."""
+
     def change(data: Any) -> Any:
-        place = at(data, keys[:-1])
-        place[keys[-1]] = to(place[keys[-1]]) if callable(to) else to
+        place, last = reduce(getitem, keys[:-1], data), keys[-1]
+        if to is None:
+            del place[last]
+        else:
+            place[last] = to(place[last]) if callable(to) else to
         return data
 
     return change
 
 
-def drop(*keys: Any) -> Callable[[Any], Any]:
-    def change(data: Any) -> Any:
-        del at(data, keys[:-1])[keys[-1]]
-        return data
-
-    return change
+drop = partial(put, to=None)
 
 
 def narrow(pixels: np.ndarray) -> np.ndarray:
@@ -221,16 +216,15 @@ def harm(path: Path, change: Callable[[Any], Any] | None) -> None:
         path.write_bytes(change(path.read_bytes()))
 
 
-SETS: dict[str, tuple[tuple[Damage, ...], Callable[..., object], Any, dict[str, str]]] = {
-    "springgaus": (SPRINGGAUS, import_springgaus.import_springgaus, SpringGausOptions(), {}),
-    "real": (REAL_FILES, import_springgaus.import_springgaus, SpringGausOptions(object="bun", no_stills=True), {}),
-    "real, stills": (STILLS, import_springgaus.import_springgaus, SpringGausOptions(object="bun", turns=1), {}),
-    "pacnerf": (PACNERF, import_pacnerf.import_pacnerf, PacNerfOptions(), {}),
-    "phystwin": (PHYSTWIN, import_phystwin.import_phystwin, PhysTwinOptions(), {}),
-    "genesis": (GENESIS, import_3dgsim.import_3dgsim, GenesisOptions(fps=25), {}),
-    "physdreamer": (PHYSDREAMER, import_physdreamer.import_physdreamer, PhysDreamerOptions(anchor=0.4),
-                    {"video_masks": "../video_masks"}),
-}  # fmt: skip
+SETS: dict[str, tuple[tuple[Damage, ...], Callable[..., object], Any]] = {
+    "springgaus": (SPRINGGAUS, import_springgaus, SpringGausOptions()),
+    "real": (REAL_FILES, import_springgaus, SpringGausOptions(object="bun", no_stills=True)),
+    "real, stills": (STILLS, import_springgaus, SpringGausOptions(object="bun", turns=1)),
+    "pacnerf": (PACNERF, import_pacnerf, PacNerfOptions()),
+    "phystwin": (PHYSTWIN, import_phystwin, PhysTwinOptions()),
+    "genesis": (GENESIS, import_3dgsim, GenesisOptions(fps=25)),
+    "physdreamer": (PHYSDREAMER, import_physdreamer, PhysDreamerOptions(anchor=0.4)),
+}
 CASES = [
     pytest.param(name, damage, id=f"{name}: {Path(damage.file).name}: {damage.told}")
     for name, (damages, *_) in SETS.items()
@@ -239,17 +233,17 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "damage"), CASES)
-def test_damaged_files_are_refused(name: str, damage: Damage, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    _, run, options, places = SETS[name]
-    sample = request.getfixturevalue(name.partition(",")[0])
-    root = sample if isinstance(sample, Path) else sample.root
+def test_damaged_files_are_refused(name: str, damage: Damage, sample_of: Callable[[str], Any], tmp_path: Path) -> None:
+    _, run, options = SETS[name]
+    root = sample_of(name.partition(",")[0]).root
+    masks = {"video_masks": root.parent / "video_masks"} if name == "physdreamer" else {}
     path = (root / damage.file).resolve()
     good = path.read_bytes()
     try:
         harm(path, damage.change)
         assert not path.exists() or path.read_bytes() != good, "the damage changes nothing"
         with pytest.raises(GausSimError) as caught:
-            run(root, tmp_path / "out", options, **{key: root / place for key, place in places.items()})
+            run(root, tmp_path / "out", options, **masks)
     finally:
         path.write_bytes(good)
     text = str(caught.value)

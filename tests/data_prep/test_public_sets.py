@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,13 +16,13 @@ import yaml
 from helpers import public_sets
 from helpers.public_sets import FRAMES, SEEN, Sample
 
-from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
 from data_prep.common.objects import train_command
-from data_prep.import_3dgsim import GenesisOptions
-from data_prep.import_pacnerf import PacNerfOptions
-from data_prep.import_physdreamer import PhysDreamerOptions
-from data_prep.import_phystwin import PhysTwinOptions, together
-from data_prep.import_springgaus import SpringGausOptions
+from data_prep.import_3dgsim import GenesisOptions, import_3dgsim
+from data_prep.import_pacnerf import PacNerfOptions, import_pacnerf
+from data_prep.import_physdreamer import PhysDreamerOptions, import_physdreamer
+from data_prep.import_physdreamer import main as main_of_physdreamer
+from data_prep.import_phystwin import PhysTwinOptions, import_phystwin, together
+from data_prep.import_springgaus import SpringGausOptions, import_springgaus
 from data_prep.public import registration
 from data_prep.public.pictures import before_white
 from gausim.core import ConfigError, GausSimError
@@ -30,8 +32,14 @@ from gausim.data.verify import verify
 from gausim.io.ply import load_scene
 from gausim.ops.visual_hull import project
 
-REAL = SpringGausOptions(object="bun", no_stills=True)
-SMALL = {"REFINED": 4, "VOXELS": 40, "REFINEMENT_STEPS": 150}
+SampleOf = Callable[[str], Any]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A registration of little work."""
+    for name, value in {"REFINED": 4, "VOXELS": 40, "REFINEMENT_STEPS": 150}.items():
+        monkeypatch.setattr(registration, name, value)
 
 
 def check_views(data: ObjectData, sample: Sample, *, tolerance: float = 40.0, solid: int = 250) -> None:
@@ -54,8 +62,9 @@ def check_views(data: ObjectData, sample: Sample, *, tolerance: float = 40.0, so
             assert np.abs(pixels[frame, view][both].astype(float) - truth[both]).mean() < tolerance
 
 
-def test_synthetic_falls_of_spring_gaus(springgaus: Sample, tmp_path: Path) -> None:
-    run = partial(import_springgaus.import_springgaus, springgaus.root, tmp_path / "out", SpringGausOptions())
+def test_synthetic_falls_of_spring_gaus(sample_of: SampleOf, tmp_path: Path) -> None:
+    springgaus = sample_of("springgaus")
+    run = partial(import_springgaus, springgaus.root, tmp_path / "out", SpringGausOptions())
     assert run()["made"] and not run()["made"] and verify(tmp_path / "out") == []
     data = ObjectData(tmp_path / "out")
     assert data.name == "torus" and data.fps == pytest.approx(1 / 0.03) and data.train_frames == range(20)
@@ -71,9 +80,10 @@ def test_synthetic_falls_of_spring_gaus(springgaus: Sample, tmp_path: Path) -> N
     np.testing.assert_array_equal(stills.cameras.viewmats, data.sequences[0].cameras.viewmats)
 
 
-def test_smaller_pictures_and_views_held_out(springgaus: Sample, tmp_path: Path) -> None:
+def test_smaller_pictures_and_views_held_out(sample_of: SampleOf, tmp_path: Path) -> None:
+    springgaus = sample_of("springgaus")
     options = SpringGausOptions(longest=24, heldout=("camera_1",), train_frames=6, name="ring", fps=30)
-    import_springgaus.import_springgaus(springgaus.root, tmp_path / "out", options)
+    import_springgaus(springgaus.root, tmp_path / "out", options)
     data = ObjectData(tmp_path / "out")
     assert (data.name, data.fps, data.train_frames, data.heldout_views) == ("ring", 30, range(6), ("camera_1",))
     assert len(data.stills().images) == 2  # what is held out is no still either
@@ -82,16 +92,13 @@ def test_smaller_pictures_and_views_held_out(springgaus: Sample, tmp_path: Path)
     half.image = lambda f, v: cv2.resize(springgaus.image(f, v), (24, 24), interpolation=cv2.INTER_AREA)  # type: ignore[method-assign]
     check_views(data, half, tolerance=10.0)
     with pytest.raises(ConfigError, match="--heldout camera_7"):
-        import_springgaus.import_springgaus(springgaus.root, tmp_path / "no", SpringGausOptions(heldout=("camera_7",)))
+        import_springgaus(springgaus.root, tmp_path / "no", SpringGausOptions(heldout=("camera_7",)))
 
 
-def test_real_captures_are_registered_by_silhouettes(
-    real: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in SMALL.items():
-        monkeypatch.setattr(registration, name, value)
+def test_real_captures_are_registered_by_silhouettes(sample_of: SampleOf, small: None, tmp_path: Path) -> None:
+    real = sample_of("real")
     options = SpringGausOptions(object="bun", turns=150)
-    results = import_springgaus.import_springgaus(real.root, tmp_path / "out", options)["results"]["objects"]["bun"]
+    results = import_springgaus(real.root, tmp_path / "out", options)["results"]["objects"]["bun"]
     found = results["registration"]
     assert found["overlap"] > 0.8 and found["scale"] == pytest.approx(real.more["scale"], rel=0.06)
     rest = (real.path[0] - real.more["shift"]) / real.more["scale"] @ real.more["turn"]
@@ -109,13 +116,13 @@ def test_real_captures_are_registered_by_silhouettes(
     assert data.train_frames == range(SEEN)
     with pytest.raises(GausSimError, match=r"overlap those of seq_000's first frame by 0\.8.*--no-stills"):
         refused = SpringGausOptions(object="bun", turns=150, least_overlap=0.99)
-        import_springgaus.import_springgaus(real.root, tmp_path / "no", refused)
+        import_springgaus(real.root, tmp_path / "no", refused)
 
 
 @pytest.mark.parametrize("kind", ["matted", "plate", "rgba"])
 def test_falls_of_pac_nerf(kind: str, tmp_path: Path) -> None:
     sample = public_sets.write_pacnerf(tmp_path / "bird", kind=kind)
-    import_pacnerf.import_pacnerf(sample.root, tmp_path / "out", PacNerfOptions())
+    import_pacnerf(sample.root, tmp_path / "out", PacNerfOptions())
     data = ObjectData(tmp_path / "out")
     assert data.fps == pytest.approx(24) and data.train_frames == range(FRAMES)
     assert data.facts["floor"]["point"] == [0, 0, 0] and data.facts["gravity"] == [0, -9.8, 0] and data.facts["free"]
@@ -141,8 +148,9 @@ def test_coverage_before_white_and_before_a_plate() -> None:
     assert (found[:2, ..., 3] == np.where((matted[:2] == 255).all(-1), 0, 255)).all()
 
 
-def test_hands_of_phystwin(phystwin: Sample, tmp_path: Path) -> None:
-    results = import_phystwin.import_phystwin(phystwin.root, tmp_path / "out", PhysTwinOptions())["results"]
+def test_hands_of_phystwin(sample_of: SampleOf, tmp_path: Path) -> None:
+    phystwin = sample_of("phystwin")
+    results = import_phystwin(phystwin.root, tmp_path / "out", PhysTwinOptions())["results"]
     notes = results["objects"][phystwin.root.name]["notes"]
     assert notes["hands"] == "12 points, 6 + 6" and notes["tracks"].startswith("4 of 5 ")
     data = ObjectData(tmp_path / "out")
@@ -160,7 +168,7 @@ def test_hands_of_phystwin(phystwin: Sample, tmp_path: Path) -> None:
     pixels = data.sequences[0].frames(range(FRAMES)).numpy()
     assert (pixels[:, :, :, :6, 3] == 0).all()  # the human's pixels
     assert "look at" not in notes
-    one = import_phystwin.import_phystwin(phystwin.root, tmp_path / "one", PhysTwinOptions(hands=1))["results"]
+    one = import_phystwin(phystwin.root, tmp_path / "one", PhysTwinOptions(hands=1))["results"]
     assert "--hands" in one["objects"][phystwin.root.name]["notes"]["look at"]
     with np.load(tmp_path / "out" / "points.npz") as cloud:
         np.testing.assert_allclose(cloud["points"], phystwin.path[0], atol=1e-6)
@@ -175,8 +183,9 @@ def test_points_that_stay_together_are_a_hand() -> None:
     assert together(points[2:], 2).tolist() == [0, 1, 1, 0, 1] and together(points, 1).tolist() == [0] * 5
 
 
-def test_samples_of_3dgsim_with_the_same_cameras_are_sequences(genesis: Sample, tmp_path: Path) -> None:
-    import_3dgsim.import_3dgsim(genesis.root, tmp_path / "out", GenesisOptions(fps=25))
+def test_samples_of_3dgsim_with_the_same_cameras_are_sequences(sample_of: SampleOf, tmp_path: Path) -> None:
+    genesis = sample_of("genesis")
+    import_3dgsim(genesis.root, tmp_path / "out", GenesisOptions(fps=25))
     data = ObjectData(tmp_path / "out")
     assert [record.name for record in data.sequences] == ["0001", "0002"] and data.train_frames == range(FRAMES)
     check_views(data, genesis)
@@ -184,33 +193,28 @@ def test_samples_of_3dgsim_with_the_same_cameras_are_sequences(genesis: Sample, 
     first, second = (record.frames(range(1)).numpy()[0, 0] for record in data.sequences)
     assert (first[-3:, :, 3] == 0).all() and (second[-3:, :, 3] == 0).all()  # the static part
     options = GenesisOptions(fps=25, segments=(3,))
-    import_3dgsim.import_3dgsim(genesis.root / "0001", tmp_path / "static", options)
+    import_3dgsim(genesis.root / "0001", tmp_path / "static", options)
     alone = ObjectData(tmp_path / "static").sequences[0].frames(range(1)).numpy()[0, 0]
     assert (alone[-3:, :, 3] == 255).all() and (alone[:-3, :, 3] == 0).all()
 
 
 def test_samples_of_3dgsim_with_other_cameras_are_objects(tmp_path: Path) -> None:
     public_sets.write_3dgsim(tmp_path / "dog", samples=("1", "10"), moved="10")
-    import_3dgsim.import_3dgsim(tmp_path / "dog", tmp_path / "out", GenesisOptions(fps=25, train_frames=8))
+    import_3dgsim(tmp_path / "dog", tmp_path / "out", GenesisOptions(fps=25, train_frames=8))
     objects = [ObjectData(tmp_path / "out" / f"dog_{i}") for i in (0, 1)]
     assert [[record.name for record in data.sequences] for data in objects] == [["1"], ["10"]]
     assert objects[1].train_frames == range(8)
     assert not (objects[0].sequences[0].cameras.viewmats == objects[1].sequences[0].cameras.viewmats).all()
 
 
-def test_stills_and_a_film_of_physdreamer(physdreamer: Path, tmp_path: Path) -> None:
-    options = PhysDreamerOptions(anchor=0.4)
-    masks = physdreamer.parent / "video_masks"
-    results = import_physdreamer.import_physdreamer(physdreamer, tmp_path / "out", options, video_masks=masks)[
-        "results"
-    ]
+def test_stills_and_a_film_of_physdreamer(sample_of: SampleOf, tmp_path: Path) -> None:
+    physdreamer = sample_of("physdreamer").root
+    options, masks = PhysDreamerOptions(anchor=0.4), physdreamer.parent / "video_masks"
+    results = import_physdreamer(physdreamer, tmp_path / "out", options, video_masks=masks)["results"]
     assert results["without_alpha"] == [] and results["stills"] == 3 and results["sequences"] == {"seq_000": FRAMES}
     data = ObjectData(tmp_path / "out")
-    assert (data.fps, data.views, data.train_frames) == (
-        30,
-        ("frame_00002",),
-        range(16),
-    ) and "gravity" not in data.facts
+    assert (data.fps, data.views, data.train_frames) == (30, ("frame_00002",), range(16))
+    assert "gravity" not in data.facts
     stills = data.stills()
     np.testing.assert_allclose(data.sequences[0].cameras.viewmats[0], stills.cameras.viewmats[1], atol=1e-5)
     film, still = data.sequences[0].frames(range(1)).numpy()[0, 0], stills.images[1].numpy()
@@ -221,17 +225,18 @@ def test_stills_and_a_film_of_physdreamer(physdreamer: Path, tmp_path: Path) -> 
     z = scene.means[:, 2].numpy()
     # Moving: above 0.5; pinned: the layer below, 0.35 away.
     assert scene.simulated.tolist() == (z > 0.2).tolist() and scene.pinned.tolist() == ((z > 0.2) & (z < 0.5)).tolist()
-    results = import_physdreamer.import_physdreamer(physdreamer, tmp_path / "bare", options)["results"]
+    results = import_physdreamer(physdreamer, tmp_path / "bare", options)["results"]
     assert results["without_alpha"] == ["seq_000"]
 
 
-def test_frames_in_place_of_a_film(physdreamer: Path, tmp_path: Path) -> None:
+def test_frames_in_place_of_a_film(sample_of: SampleOf, tmp_path: Path) -> None:
+    physdreamer = sample_of("physdreamer").root
     root = tmp_path / "hat"
     shutil.copytree(physdreamer, root)
     (root / "videos" / "frame_00002_poke.mp4").unlink()
     for frame in range(4):
         public_sets.save(root / "videos" / f"{frame}.png", np.full((32, 32, 3), 60 * frame, np.uint8))
-    run = partial(import_physdreamer.import_physdreamer, root, tmp_path / "out")
+    run = partial(import_physdreamer, root, tmp_path / "out")
     with pytest.raises(ConfigError, match="--view and --fps"):
         run(PhysDreamerOptions(anchor=0.4))
     results = run(PhysDreamerOptions(anchor=0.4, view="frame_00003", fps=25))["results"]
@@ -240,15 +245,15 @@ def test_frames_in_place_of_a_film(physdreamer: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_body_that_turns_onto_itself_is_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in SMALL.items():
-        monkeypatch.setattr(registration, name, value)
+def test_a_body_that_turns_onto_itself_is_ambiguous(
+    small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = public_sets.bar()
     plain.colors[:] = 150
     monkeypatch.setattr(public_sets, "dog", lambda scale: plain)
     sample = public_sets.write_springgaus_real(tmp_path / "real")
     options = SpringGausOptions(object="bun", turns=150, least_overlap=0)
-    made = import_springgaus.import_springgaus(sample.root, tmp_path / "out", options)["results"]["objects"]["bun"]
+    made = import_springgaus(sample.root, tmp_path / "out", options)["results"]["objects"]["bun"]
     assert made["notes"]["look at"].startswith("another turn")
 
 
@@ -259,41 +264,38 @@ def test_the_command_that_trains_fits_the_frames() -> None:
     assert train_command("duck", Path("out")) == "gausim train data=object data.root=out name=duck"
 
 
-def test_two_sequences_of_one_name_are_refused(real: Sample, tmp_path: Path) -> None:
+def test_two_sequences_of_one_name_are_refused(sample_of: SampleOf, tmp_path: Path) -> None:
+    real = sample_of("real")
     path = real.root / "dynamic" / "sequences" / "bun" / "00.json"
     shutil.copyfile(path.with_name("0.json"), path)
     try:
         with pytest.raises(GausSimError, match="two sequences would get the name 'seq_000'"):
-            import_springgaus.import_springgaus(real.root, tmp_path / "out", REAL)
+            import_springgaus(real.root, tmp_path / "out", SpringGausOptions(object="bun", no_stills=True))
     finally:
         path.unlink()
 
 
 def test_options_that_do_not_suit_the_folder(
-    springgaus: Sample,
-    real: Sample,
-    phystwin: Sample,
-    genesis: Sample,
-    physdreamer: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    sample_of: SampleOf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    names = ("springgaus", "real", "phystwin", "genesis", "physdreamer")
+    torus, real, sloth, dog, hat = (sample_of(name).root for name in names)
     lines = (
-        (import_springgaus, springgaus.root, "--object bun", "--object"),
-        (import_springgaus, real.root, "--object cat", "['bun']"),
-        (import_springgaus, tmp_path, "", "camera.json"),
-        (import_springgaus, springgaus.root, "--train-frames 30", "24 frames, fewer than the 30"),
-        (import_3dgsim, genesis.root, "", "--fps"),
-        (import_3dgsim, tmp_path, "--fps 25", "metadata.json"),
-        (import_pacnerf, tmp_path, "", "all_data.json"),
-        (import_phystwin, tmp_path, "", "metadata.json"),
-        (import_phystwin, phystwin.root, "--hands 2 --human-masks nowhere", "--human-masks"),
-        (import_physdreamer, tmp_path, "", "no COLMAP model"),
-        (import_physdreamer, physdreamer, "--view frame_9", "frame_00001"),
-        (import_physdreamer, physdreamer, "", "--anchor"),
-        (import_physdreamer, physdreamer, "--train-frames 30", "24 frames, fewer than the 30"),
-        (import_physdreamer, physdreamer, "--video-masks nowhere", "--video-masks"),
+        (import_springgaus.main, torus, "--object bun", "--object"),
+        (import_springgaus.main, real, "--object cat", "['bun']"),
+        (import_springgaus.main, tmp_path, "", "camera.json"),
+        (import_springgaus.main, torus, "--train-frames 30", "24 frames, fewer than the 30"),
+        (import_3dgsim.main, dog, "", "--fps"),
+        (import_3dgsim.main, tmp_path, "--fps 25", "metadata.json"),
+        (import_pacnerf.main, tmp_path, "", "all_data.json"),
+        (import_phystwin.main, tmp_path, "", "metadata.json"),
+        (import_phystwin.main, sloth, "--hands 2 --human-masks nowhere", "--human-masks"),
+        (main_of_physdreamer, tmp_path, "", "no COLMAP model"),
+        (main_of_physdreamer, hat, "--view frame_9", "frame_00001"),
+        (main_of_physdreamer, hat, "", "--anchor"),
+        (main_of_physdreamer, hat, "--train-frames 30", "24 frames, fewer than the 30"),
+        (main_of_physdreamer, hat, "--video-masks nowhere", "--video-masks"),
     )
-    for module, root, line, told in lines:
-        assert module.main([str(root), "--out", str(tmp_path / "out"), *line.split()]) == 2
-        assert told in capsys.readouterr().err, (module.__name__, line)
+    for command, root, line, told in lines:
+        assert command([str(root), "--out", str(tmp_path / "out"), *line.split()]) == 2
+        assert told in capsys.readouterr().err, (root, line)

@@ -20,15 +20,14 @@ from data_prep.synthetic.plan import RECIPES, SMALL_SWING, Material, Plan
 from data_prep.synthetic.pushes import DRAWS, Push, push_field, pushed_motion, random_motion, random_push
 from data_prep.synthetic.rig import still_cameras, video_cameras
 from data_prep.synthetic.writer import SyntheticObject
-from gausim.core import DivergenceError, Trajectory
+from gausim.core import DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import composite
-from gausim.render.draw import film
+from gausim.ops.visual_hull import project
+from gausim.render.draw import draw_still
 from gausim.render.reference import ReferenceRenderer
 
 TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
-
-
 PUSHED = ("flower", "pudding")
 
 
@@ -66,10 +65,7 @@ def test_first_frame_is_the_rest_scene_as_the_oracle_draws_it(made: Path) -> Non
     """Closes the loop through PLY, cameras and PNG: a wrong axis, order or alpha anywhere breaks it."""
     for item in ReadyDataModule(made).objects:
         scene, record = item.scene(), item.sequences[0]
-        still = torch.zeros(1, dtype=torch.long).expand(scene.count)
-        eye = torch.eye(3).expand(1, 1, 3, 3)
-        rest = Trajectory(scene.means[None], eye, eye, still, record.fps)
-        drawn = film(ReferenceRenderer(), scene, rest, record.cameras, as_bytes=False)
+        drawn = draw_still(ReferenceRenderer(), scene, record.cameras).rgb
         stored, alpha = composite(record.frames(range(1)))
         assert (drawn - stored).abs().max() < 1.5 / 255
         assert 0.05 < (alpha > 0.5).float().mean() < 0.8
@@ -126,10 +122,8 @@ def test_objects_stay_in_every_image_while_they_swing(name: str) -> None:
     moving = torch.from_numpy(body.nodes + height[:, None] * swing[:, None]).float().reshape(-1, 3)
     video, still = video_cameras(center, radius, 96, names), still_cameras(center, radius, 96, 24)
     for cameras, x in ((video, moving), (still, torch.from_numpy(body.nodes).float())):
-        camera = x @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
-        pixel = camera @ cameras.Ks.mT
-        pixel = pixel[..., :2] / pixel[..., 2:]
-        assert camera[..., 2].min() > 0 and pixel.min() > 2 and pixel.max() < 94
+        pixel, depth = project(x, cameras.viewmats, cameras.Ks)
+        assert depth.min() > 0 and pixel.min() > 2 and pixel.max() < 94
         assert (pixel.amax(1) - pixel.amin(1)).amax(-1).min() > 48, "the object is small in the image"
 
 

@@ -16,12 +16,13 @@ if importlib.util.find_spec("mujoco") is None:
 from data_prep.synthesize import main
 from data_prep.synthetic.bodies import bar, jelly
 from data_prep.synthetic.elastic import ElasticBody
-from data_prep.synthetic.falls import Fall, fall_field, random_fall
 from data_prep.synthetic.hands import held_path, random_path
 from data_prep.synthetic.plan import QUICK, RECIPES
+from data_prep.synthetic.pushes import Fall, fall_field, random_fall
 from data_prep.synthetic.rig import video_cameras
 from data_prep.synthetic.writer import SyntheticObject
 from gausim.data.objects import ObjectData
+from gausim.ops.visual_hull import project
 
 FPS = 24
 JELLY, BAR = RECIPES["jelly_fall"], RECIPES["bar_hands"]
@@ -145,11 +146,9 @@ def test_every_sequence_stays_in_view_sound_and_above_the_floor(name: str) -> No
     cameras = video_cameras(np.asarray(made.room[0]), made.room[1], 96, made.plan.views)
     for number in range(8):
         motion, _ = made._motion(number)
-        x = torch.from_numpy(made.points.positions(motion)).float()[:, None]
-        camera = x @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
-        pixel = camera @ cameras.Ks.mT
-        pixel = pixel[..., :2] / pixel[..., 2:]
-        assert camera[..., 2].min() > 0 and pixel.min() > 0 and pixel.max() < 96
+        points = torch.from_numpy(made.points.positions(motion)).float().reshape(-1, 3)
+        pixel, depth = project(points, cameras.viewmats, cameras.Ks)
+        assert depth.min() > 0 and pixel.min() > 0 and pixel.max() < 96
         volume = np.linalg.det(made.points.deformation_gradients(motion))
         assert volume.min() > 0.1, "elements turned inside out"
         if name == "jelly_fall":
