@@ -18,8 +18,7 @@ from gausim.core import ConfigError, DataError, RunError
 from gausim.data import frames as frames_of_files
 from gausim.data import records
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.objects import ObjectData
-from gausim.data.reserved import reserved_part
+from gausim.data.objects import ObjectData, reserved_part
 from gausim.doctor.examine import examine
 from gausim.results.looks import read_looks
 

@@ -47,23 +47,6 @@ def test_surroundings_are_those_of_the_facts(spoilt: Path) -> None:
     assert ObjectData(spoilt).scene().surroundings == world
 
 
-@pytest.mark.parametrize(
-    ("facts", "message"),
-    [
-        ({"gravity": [0, 0]}, "gravity"),
-        ({"floor": {"point": [0, 0, 0]}}, "normal"),
-        ({"floor": {"point": [0, 0, 0], "normal": [0, 0, 0]}}, "'floor.normal'"),
-        ({"floor": {"point": [0, 0, 0], "normal": [0, 0, 1], "friction": -1}}, "friction"),
-        ({"free": "yes"}, "free"),
-        ({"grip": 0}, "grip"),
-    ],
-)
-def test_wrong_surroundings_are_refused(spoilt: Path, facts: dict[str, object], message: str) -> None:
-    surround(spoilt, **facts)
-    with pytest.raises(DataError, match=rf"dataset\.json.*{message}"):
-        ObjectData(spoilt)
-
-
 def _hold(root: Path, **changed: object) -> None:
     """Hands at the first and the last kernel of the scene, in every sequence."""
     means = ObjectData(root).scene().means.numpy()
@@ -142,9 +125,6 @@ def test_composite_over_black_and_over_a_color() -> None:
     torch.testing.assert_close(rgb[0], torch.tensor([[0.6, 0.28, 0.8], [0.5, 0.25, 1.0]]))
 
 
-SEQUENCE = Path("sequences/seq_000")
-
-
 def _moved(data: dict) -> None:
     data["frames"][FRAMES + 5]["transform_matrix"][0][3] += 0.1
 
@@ -163,13 +143,13 @@ def _without_a_view(data: dict) -> None:
     ],
 )
 def test_wrong_cameras_of_a_sequence(spoilt: Path, edit: Callable, message: str) -> None:
-    edit_json(spoilt / SEQUENCE / "transforms.json", edit)
+    edit_json(spoilt / "sequences" / "seq_000" / "transforms.json", edit)
     with pytest.raises(DataError, match=message):
         _ = ObjectData(spoilt).sequences
 
 
 def test_wrong_images(spoilt: Path) -> None:
-    folder, record = spoilt / SEQUENCE / "cam_0", ObjectData(spoilt).sequences[0]
+    folder, record = spoilt / "sequences" / "seq_000" / "cam_0", ObjectData(spoilt).sequences[0]
     cv2.imwrite(str(folder / "0000.png"), frame_pixels(0, 0, 0).astype(np.uint16))
     (folder / "0001.png").write_bytes(b"no image")
     (folder / "0002.png").unlink()
@@ -185,16 +165,22 @@ def test_wrong_images(spoilt: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("fps", 0, "field 'fps': expected 'float' > 0"),
-        ("views", "cam_0", "field 'views': expected 'array', got 'str'"),
+        ("fps", 0, r"dataset\.json: field 'fps': expected 'float' > 0"),
+        ("views", "cam_0", r"dataset\.json: field 'views': expected 'array', got 'str'"),
         ("train_views", ["cam_0", "cam_7"], "must be disjoint parts of 'views'"),
         ("heldout_views", ["cam_0"], "must be disjoint parts of 'views'"),
         ("train_frames", [1, 16], "field 'train_frames"),
         ("train_frames", [0, 40], "has 20 frames, dataset.json trains on"),
+        ("gravity", [0, 0], r"dataset\.json.*gravity"),
+        ("floor", {"point": [0, 0, 0]}, r"dataset\.json.*normal"),
+        ("floor", {"point": [0, 0, 0], "normal": [0, 0, 0]}, r"dataset\.json.*'floor.normal'"),
+        ("floor", {"point": [0, 0, 0], "normal": [0, 0, 1], "friction": -1}, r"dataset\.json.*friction"),
+        ("free", "yes", r"dataset\.json.*free"),
+        ("grip", 0, r"dataset\.json.*grip"),
     ],
 )
 def test_wrong_facts(spoilt: Path, field: str, value: object, message: str) -> None:
-    edit_json(spoilt / "dataset.json", lambda d: d.update({field: value}))
+    surround(spoilt, **{field: value})
     with pytest.raises(DataError, match=message):
         _ = ObjectData(spoilt).sequences
 

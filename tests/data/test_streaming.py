@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
+import torch
 from helpers.blob import make_object, ring_of_cameras
 from helpers.plain import edit_json
 
@@ -16,6 +17,7 @@ from gausim.core import Cameras
 from gausim.data import frames as frames_module
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
+from gausim.data.dataset import SequenceSample
 from gausim.data.records import SequenceRecord
 from gausim.io.packed import HEADER, PIXELS, Crop, header
 
@@ -42,25 +44,31 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def stream(root: Path, **options: object) -> ReadyDataModule:
+def stream(root: Path | list[Path], **options: object) -> ReadyDataModule:
     settings: dict = {"batch_size": 2, "repeats": 1, "curriculum": Curriculum(t_max=5), **options}
     data = ReadyDataModule(root, **settings)
     data.setup("fit")
     return data
 
 
-def epoch(data: ReadyDataModule, number: int) -> list[list[tuple[int, int]]]:
+def batches(data: ReadyDataModule, number: int) -> Iterator[list[SequenceSample]]:
+    """The batches of an epoch."""
     loader = data.train_dataloader()
     loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
-    return [[(s.sequence_id, int(s.frames[-1, 0, -1, -1, 2]) - 3) for s in batch] for batch in loader]
+    yield from loader
+
+
+def shown(data: ReadyDataModule, number: int) -> list[list[tuple[int, int]]]:
+    """Sequence and last frame of every sample of an epoch; frames carry their number."""
+    return [[(s.sequence_id, int(s.frames[-1, 0, -1, -1, 2]) - 3) for s in batch] for batch in batches(data, number)]
 
 
 def test_reading_ahead_changes_nothing(mixed: Path) -> None:
     plain, ahead = stream(mixed, repeats=3), stream(mixed, prefetch=2, repeats=3)
     for number in (0, 2):
-        found = epoch(ahead, number)
-        assert found == epoch(plain, number) and len(found) == 8
-        # The last frame that a sample shows is T = epoch + 1; frames carry their number.
+        found = shown(ahead, number)
+        assert found == shown(plain, number) and len(found) == 8
+        # The last frame that a sample shows is T = epoch + 1.
         assert {last for batch in found for _, last in batch} == {number + 1}
 
 
@@ -74,17 +82,14 @@ def test_memory_does_not_grow_with_the_set(tmp_path: Path) -> None:
     for number in range(sequences):
         _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side, block)
     data = stream(root, batch_size=1, curriculum=Curriculum(t_start=15))
-    loader = data.train_dataloader()
     batch = frames * 2 * 4 * side * side  # two training views
     tracemalloc.start()
     try:
         peaks = []
         for number in range(3):
-            loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
             tracemalloc.reset_peak()
-            shown = sum(len(b) for b in loader)
+            assert sum(len(b) for b in batches(data, number)) == sequences
             peaks.append(tracemalloc.get_traced_memory()[1])
-            assert shown == sequences
     finally:
         tracemalloc.stop()
     # The old one while the new one is read.
@@ -114,9 +119,9 @@ def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatc
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2)  # type: ignore[assignment]
         data.setup("fit")
         read.clear()
-        shown = [(s.object_name, s.sequence_name) for batch in data.train_dataloader() for s in batch]
-        assert sorted(read) == sorted(shown) and len(set(read)) == len(read)
-        shares += shown
+        share = [(s.object_name, s.sequence_name) for batch in data.train_dataloader() for s in batch]
+        assert sorted(read) == sorted(share) and len(set(read)) == len(read)
+        shares += share
     assert sorted(shares) == [*(("apple", f"seq_{i:03d}") for i in range(3)), ("pear", "seq_000"), ("pear", "seq_001")]
 
 
@@ -131,23 +136,18 @@ def test_a_growing_rollout_reads_no_frame_twice(mixed: Path, monkeypatch: pytest
     monkeypatch.setattr(frames_module, "read_rgba_into", noted)
     data = stream(mixed, repeats=2)
     for number in range(6):
-        epoch(data, number)
+        list(batches(data, number))
         assert len(set(decoded)) == len(decoded) == (number + 2 if number < 5 else 6) * (3 * 2 + 2 * 1)
 
 
 def test_a_packed_and_an_unpacked_object_train_together(mixed: Path, tmp_path: Path) -> None:
     pack(mixed / "pear", tmp_path / "pear")
-    both = stream(mixed)
-    roots = [mixed / "apple", tmp_path / "pear"]
-    half = ReadyDataModule(roots, batch_size=2, repeats=1, curriculum=Curriculum(t_max=5))
-    half.setup("fit")
+    both, half = stream(mixed), stream([mixed / "apple", tmp_path / "pear"])
     for number in (0, 3):
         for one, other in zip(_whole(both, number), _whole(half, number), strict=True):
-            assert one[0] == other[0] and np.array_equal(one[1], other[1])
+            assert one[0] == other[0] and torch.equal(one[1], other[1])
 
 
-def _whole(data: ReadyDataModule, number: int) -> list[tuple[str, np.ndarray]]:
-    loader = data.train_dataloader()
-    loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
+def _whole(data: ReadyDataModule, number: int) -> list[tuple[str, torch.Tensor]]:
     # Colours of fully transparent pixels are not kept by packing.
-    return [(s.sequence_name, (s.frames * (s.frames[..., 3:] > 0)).numpy()) for batch in loader for s in batch]
+    return [(s.sequence_name, s.frames * (s.frames[..., 3:] > 0)) for batch in batches(data, number) for s in batch]

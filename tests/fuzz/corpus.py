@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import plyfile
 import torch
 from helpers import colmap_files, public_sets, toy_object
 from helpers.corpus import write_corpus
@@ -91,11 +92,7 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     yield Reader("scene", path, "text", load_scene, 8)
     text = folder / "scene_text" / "scene.ply"
     save_scene(replace(SCENE, name="text"), text)
-    head, body = path.read_bytes().split(b"end_header\n")
-    head = head.replace(b"binary_little_endian", b"ascii")
-    table = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))
-    rows = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
-    text.write_bytes(head + b"end_header\n" + rows.encode() + b"\n")
+    plyfile.PlyData(plyfile.PlyData.read(path).elements, text=True).write(text)
     yield Reader("scene, text", text, "text", load_scene)
     yield Reader("points", text, "text", read_points)
     mesh = folder / "mesh.ply"

@@ -49,23 +49,17 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
     # Headers decide most; they stand in front.
     at = at if rng.random() < 0.6 else at % min(len(data), 256)
     size = min(len(data) - at, rng.choice((1, 2, 4, 8, 16, 64, 256)))
-    way = rng.randrange(8)
-    if way == 0:
-        return data[:at]
-    if way == 1:
-        return data[:at] + data[at + size :]
-    if way == 2:
-        return data[: at + size] + data[at:]
-    if way == 3:
-        return data[:at] + rng.randbytes(size) + data[at + size :]
-    if way == 4:
-        return data[:at] + rng.randbytes(size) + data[at:]
-    if way == 5:
-        return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
-    if way == 6:
-        word = rng.choice(WORDS)
-        return data[:at] + word + data[at + len(word) :]
-    return data + rng.randbytes(size)
+    ways: tuple[Callable[[], bytes], ...] = (
+        lambda: data[:at],
+        lambda: data[:at] + data[at + size :],
+        lambda: data[: at + size] + data[at:],
+        lambda: data[:at] + rng.randbytes(size) + data[at + size :],
+        lambda: data[:at] + rng.randbytes(size) + data[at:],
+        lambda: data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :],
+        lambda: data[:at] + (word := rng.choice(WORDS)) + data[at + len(word) :],
+        lambda: data + rng.randbytes(size),
+    )
+    return rng.choice(ways)()
 
 
 def _json(data: bytes, rng: random.Random) -> bytes:

@@ -12,10 +12,10 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import multiprocessing
 import os
 import random
 import resource
-import select
 import signal
 import sys
 import tempfile
@@ -24,6 +24,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -71,33 +72,28 @@ def _check_seeds(found: list[Reader]) -> None:
 
 def _outcomes(deck: list[Reader], numbers: list[int], seed: int, keep: Path | None) -> Iterator[tuple[int, str]]:
     """``refused``, ``read`` or a fault for each case, from children that are replaced when they die or hang."""
-    at = 0
+    at, context = 0, multiprocessing.get_context("fork")
     while at < len(numbers):
-        inlet, outlet = os.pipe()
-        child = os.fork()
-        if child == 0:
-            os.close(inlet)
-            _work(deck, numbers[at:], seed, keep, outlet)
-        os.close(outlet)
-        with os.fdopen(inlet, "rb", buffering=0) as told:
-            rest = b""
-            while select.select([told], [], [], PATIENCE)[0]:
-                block = told.read(1 << 16)
-                if not block:
-                    break
-                *lines, rest = (rest + block).split(b"\n")
-                for line in lines:
-                    yield numbers[at], json.loads(line)
-                    at += 1
-            else:
-                os.kill(child, signal.SIGKILL)
-        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        if status != 0:
-            yield numbers[at], "hangs" if status == -signal.SIGKILL else f"ends the process (status {status})"
+        inlet, outlet = context.Pipe(duplex=False)
+        child = context.Process(target=_work, args=(deck, numbers[at:], seed, keep, outlet))
+        child.start()
+        outlet.close()
+        try:
+            while inlet.poll(PATIENCE):
+                outcome = inlet.recv()
+                yield numbers[at], outcome
+                at += 1
+            child.kill()
+        except EOFError:  # it has ended
+            pass
+        child.join()
+        if child.exitcode != 0:
+            hangs = child.exitcode == -signal.SIGKILL
+            yield numbers[at], "hangs" if hangs else f"ends the process (status {child.exitcode})"
             at += 1
 
 
-def _work(deck: list[Reader], numbers: list[int], seed: int, keep: Path | None, outlet: int) -> None:
+def _work(deck: list[Reader], numbers: list[int], seed: int, keep: Path | None, outlet: Connection) -> None:
     """Runs cases one after the other in this process, and tells the outcome of each."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)  # decoders complain
@@ -118,7 +114,7 @@ def _work(deck: list[Reader], numbers: list[int], seed: int, keep: Path | None, 
             reader.file.write_bytes(good)
         if keep is not None and outcome not in ("refused", "read"):
             (keep / f"{number}_{reader.file.name}").write_bytes(bad)
-        os.write(outlet, json.dumps(outcome).encode() + b"\n")
+        outlet.send(outcome)
     os._exit(0)
 
 

@@ -12,7 +12,7 @@ from gausim.core import Cameras
 from gausim.data.images import write_rgba
 from gausim.io.transforms import write_transforms
 from helpers import toy_object
-from helpers.plain import edit_json, plain_scene
+from helpers.plain import cameras_at, edit_json, plain_scene
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
 FRAMES, SEQUENCES, WIDTH, HEIGHT, POINTS = 20, 3, 8, 6, 5
@@ -20,13 +20,10 @@ FRAMES, SEQUENCES, WIDTH, HEIGHT, POINTS = 20, 3, 8, 6, 5
 
 def ring_of_cameras(names: tuple[str, ...], *, width: int = WIDTH, height: int = HEIGHT) -> Cameras:
     """Cameras that stand around the z axis and look at the origin, level."""
-    viewmats = torch.eye(4).repeat(len(names), 1, 1)
-    for i in range(len(names)):
-        a = 2 * math.pi * i / max(3, len(names))
-        rows = [[-math.sin(a), math.cos(a), 0.0], [0.0, 0.0, -1.0], [-math.cos(a), -math.sin(a), 0.0]]
-        viewmats[i, :3, :3] = torch.tensor(rows)
-        viewmats[i, :3, 3] = torch.tensor([0.0, 0.0, 4.0])
+    angles = 2 * math.pi * torch.arange(len(names)) / max(3, len(names))
+    eyes = 4 * torch.stack((angles.cos(), angles.sin(), 0 * angles), 1)
     k = torch.tensor([[9.0, 0.0, width / 2], [0.0, 9.5, height / 2], [0.0, 0.0, 1.0]])
+    viewmats = cameras_at(eyes, (0.0, 0.0, 0.0), focal=9.0, size=width, names=names).viewmats
     return Cameras(viewmats, k.expand(len(names), 3, 3).clone(), width, height, names)
 
 

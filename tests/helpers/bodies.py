@@ -15,6 +15,7 @@ from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.material import MaterialTemplate
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.springs import Springs
+from helpers.random_scene import FIELDS
 from helpers.simulators import gausim
 
 # The settings of `model=gausim`, small.
@@ -79,8 +80,7 @@ def join_states(states: Sequence[SimState]) -> SimState:
 
 
 def permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
-    names = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
-    return replace(scene, **{n: getattr(scene, n)[order] for n in names})
+    return replace(scene, **{n: getattr(scene, n)[order] for n in FIELDS})
 
 
 def pull_of(

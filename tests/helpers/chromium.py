@@ -133,7 +133,21 @@ class Page:
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
         """Clicks the panel's button or tab of this label with the mouse."""
-        self._press(_labelled(label, elements), label)
+        script = (
+            f"(() => {{ const b = {_labelled(label, elements)}; if (!b) return null; "
+            "b.scrollIntoView({block: 'nearest'}); "
+            "const r = b.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+
+        def place() -> Any:
+            before = self.run(script)
+            time.sleep(0.2)
+            return before if before and before == self.run(script) else None
+
+        middle = self.wait(place, 20, f"{label!r}")  # folders open slowly
+        self.press(*middle)
+        self.release(*middle)
+        time.sleep(0.3)
 
     def press_text(self, label: str, elements: str) -> None:
         """Clicks the innermost of some elements with this text."""
@@ -150,23 +164,6 @@ class Page:
     def _click(self, element: str, label: str) -> None:
         script = f"(() => {{ const found = {element}; if (found) found.click(); return !!found; }})()"
         self.wait(lambda: self.run(script), 20, f"{label!r}")
-
-    def _press(self, element: str, label: str) -> None:
-        """Clicks the middle of an element once it stands still: folders open slowly."""
-        script = (
-            f"(() => {{ const b = {element}; if (!b) return null; b.scrollIntoView({{block: 'nearest'}}); "
-            "const r = b.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-        )
-
-        def place() -> Any:
-            before = self.run(script)
-            time.sleep(0.2)
-            return before if before and before == self.run(script) else None
-
-        middle = self.wait(place, 20, f"{label!r}")
-        self.press(*middle)
-        self.release(*middle)
-        time.sleep(0.3)
 
 
 def _labelled(label: str, elements: str) -> str:

@@ -6,12 +6,9 @@ import math
 import struct
 from pathlib import Path
 
-import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
 
-MODEL_NUMBERS = {
-    "SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6, "FOV": 7, "SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10,
-}  # fmt: skip
 Camera = tuple[str, int, int, list[float]]
 Image = tuple[str, int, tuple[float, ...], tuple[float, ...], list[tuple[float, float, int]]]
 Point = tuple[int, tuple[float, float, float], tuple[int, int, int], float, list[tuple[int, int]]]
@@ -20,20 +17,15 @@ Point = tuple[int, tuple[float, float, float], tuple[int, int, int], float, list
 def turntable(azimuth: float, distance: float = 4.0) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Quaternion w x y z and translation of a level camera that looks at the origin, with world z up."""
     c, s = math.cos(azimuth), math.sin(azimuth)
-    rows = np.array([[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]])
-    w = math.sqrt(max(0.0, 1 + np.trace(rows))) / 2
-    if w > 1e-6:
-        vector = np.array([rows[2, 1] - rows[1, 2], rows[0, 2] - rows[2, 0], rows[1, 0] - rows[0, 1]]) / (4 * w)
-        return (w, *vector), (0.0, 0.0, distance)
-    axis = np.linalg.eigh(rows)[1][:, -1]
-    return (0.0, *axis), (0.0, 0.0, distance)
+    rows = [[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]]
+    return tuple(Rotation.from_matrix(rows).as_quat(scalar_first=True)), (0.0, 0.0, distance)
 
 
 def write_binary(folder: Path, cameras: dict[int, Camera], images: dict[int, Image], points: list[Point]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     data = struct.pack("<Q", len(cameras))
     for number, (model, width, height, params) in cameras.items():
-        data += struct.pack("<IiQQ", number, MODEL_NUMBERS[model], width, height)
+        data += struct.pack("<IiQQ", number, int(getattr(pycolmap.CameraModelId, model)), width, height)
         data += struct.pack(f"<{len(params)}d", *params)
     (folder / "cameras.bin").write_bytes(data)
     data = struct.pack("<Q", len(images))

@@ -7,10 +7,10 @@ backward pass: after one, torch refuses to fork.
 
 from __future__ import annotations
 
-import importlib
 import json
 import multiprocessing
 import os
+import pydoc
 import random
 import resource
 import select
@@ -40,10 +40,7 @@ def die_at(target: str, match: str, count: int, when: str, rank: int = 0, by: st
         os.kill(others[rank - 1].pid if rank else os.getpid(), signal.Signals[by])
 
     home, name = target.rsplit(".", 1)
-    try:
-        owner: Any = importlib.import_module(home)
-    except ModuleNotFoundError:
-        owner = getattr(importlib.import_module(home.rsplit(".", 1)[0]), home.rsplit(".", 1)[1])
+    owner = pydoc.locate(home)
     original, calls = getattr(owner, name), 0
 
     def dying(*args: Any, **kwargs: Any) -> Any:

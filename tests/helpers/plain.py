@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gausim.core import Cameras, GaussianScene
+from gausim.ops.orbit import look_at
 
 
 def plain_scene(
@@ -31,12 +32,7 @@ def plain_scene(
 
 def cameras_at(eyes: Tensor, at: Sequence[float], *, focal: float, size: int, names: Sequence[str]) -> Cameras:
     """Square cameras at some places, z up, that look at another."""
-    viewmats = torch.eye(4).repeat(len(eyes), 1, 1)
-    for viewmat, eye in zip(viewmats, eyes, strict=True):
-        forward = torch.nn.functional.normalize(torch.tensor(at) - eye, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    viewmats = torch.stack([look_at(eye, torch.tensor(at), torch.tensor([0.0, 0.0, 1.0])) for eye in eyes])
     k = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     return Cameras(viewmats, k.repeat(len(eyes), 1, 1), size, size, tuple(names))
 

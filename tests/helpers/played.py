@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import torch
 
 from gausim.compose.build import LoadedRun
+from gausim.core import SimState
 from gausim.data.objects import ObjectData
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -48,8 +49,6 @@ def played_run(folder: Path) -> LoadedRun:
             velocity[0] = 0.05 * (number + 1)
 
     def predict(sequence: int, steps: int):
-        from gausim.core import SimState
-
         with torch.no_grad():
             return SceneDynamics(model).rollout(SimState(toy.scene.means, states.state(sequence).previous), steps)
 

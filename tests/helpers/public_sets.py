@@ -11,11 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from data_prep.public.pictures import resized
 from gausim.io.ply import save_scene
 from gausim.io.video import write_video
+from gausim.ops.orbit import look_at
 from helpers import colmap_files, toy_object
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -77,13 +79,7 @@ def dog(scale: float = 1.0) -> Body:
 
 def look(eye: np.ndarray, at: np.ndarray, up: np.ndarray) -> np.ndarray:
     """(4, 4) world to camera, OpenCV."""
-    forward = (at - eye) / np.linalg.norm(at - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack((right, np.cross(forward, right), forward))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return viewmat
+    return look_at(*map(torch.from_numpy, (eye, at, up))).numpy()
 
 
 def rig(
@@ -337,8 +333,7 @@ def write_cloud(path: Path, points: np.ndarray) -> None:
 
 def colmap_pose(viewmat: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Quaternion w x y z and translation."""
-    x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat()
-    return (w, x, y, z), tuple(viewmat[:3, 3])
+    return tuple(Rotation.from_matrix(viewmat[:3, :3]).as_quat(scalar_first=True)), tuple(viewmat[:3, 3])
 
 
 def dump(path: Path, data: Any) -> None:

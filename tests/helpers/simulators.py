@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -19,23 +20,8 @@ from gausim.models.step.recursion import Solved, Units
 from gausim.models.step.simulator import GausSim
 from gausim.nn.meshgraphnet import MeshGraphNet
 
-PARTS: dict[str, tuple[str, ...]] = {
-    "hierarchy": ("clustering", "max_neighbours", "edges", "share_network", "body_frame"),
-    "features": (
-        "angle",
-        "rest_inputs",
-        "coarse_inputs",
-        "velocities",
-        "centred",
-        "attributes",
-        "gravity",
-        "normaliser_floor",
-        "floor",
-    ),
-    "network": ("hidden", "layers", "norm", "activation", "precision", "checkpoint", "compile"),
-    "head": ("output_scale", "zero_output", "lever", "anchor"),
-    "rollout": ("cuda_graph", "energy_guard_frames"),
-}
+PARTS = {"hierarchy": HierarchySettings, "features": FeatureOptions, "network": MeshGraphNet, "head": Head,
+         "rollout": RolloutSettings}  # fmt: skip
 
 # As an override of `gausim train`: two levels for an object of a few kernels.
 LEVELS = "model.simulator.hierarchy.levels=[{diameter: 0.7, edge_length: 2.0},{diameter: 0.3, edge_length: 0.4}]"
@@ -70,7 +56,10 @@ def gausim(
     **options: Any,
 ) -> GausSim:
     """A simulator; an option that no part has goes to the constructor."""
-    given = {part: {n: options.pop(n) for n in names if n in options} for part, names in PARTS.items()}
+    given = {
+        part: {n: options.pop(n) for n in inspect.signature(kind).parameters if n in options}
+        for part, kind in PARTS.items()
+    }
     found = levels(radii, predicted_levels, graph_radii)
     return GausSim(
         scenes,

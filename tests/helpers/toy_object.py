@@ -17,7 +17,7 @@ from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
-from helpers.plain import cameras_at, plain_scene
+from helpers.plain import cameras_at, edit_json, plain_scene
 
 AMPLITUDES = {"seq_000": 0.4, "seq_001": -0.25}
 OMEGA, SIZE, VIEWS = 0.45, 32, ("cam_0", "cam_1", "cam_2")
@@ -88,8 +88,7 @@ def write_object(toy: ToyObject) -> ToyObject:
 
 def surround(root: Path, **facts: object) -> None:
     """States surroundings of a written object."""
-    path = root / "dataset.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+    edit_json(root / "dataset.json", lambda data: data.update(facts))
 
 
 def hold(root: Path, points: Tensor, way: Tensor, *, grip: float = 0.5) -> None:

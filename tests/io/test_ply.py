@@ -28,18 +28,15 @@ def columns_of(scene: GaussianScene) -> dict[str, np.ndarray]:
     return columns | {f"rot_{i}": scene.quats[:, i].numpy() for i in range(4)}
 
 
-def write_ply(
-    path: Path, columns: dict[str, np.ndarray], *, kind: str = "float", order: str = "<", cut: int = 0, extra: str = ""
-) -> None:
-    code = {"float": "f4", "double": "f8"}[kind]
-    table = np.empty(len(columns["x"]), dtype=[(n, order + code) for n in columns])
+def write_ply(path: Path, columns: dict[str, np.ndarray], kind: str = "f4", **layout: object) -> None:
+    """Writes vertices, and a camera with a list behind them."""
+    table = np.empty(len(columns["x"]), dtype=[(n, kind) for n in columns])
     for n, value in columns.items():
         table[n] = value
-    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
-    header = f"ply\nformat {name} 1.0\ncomment by hand\nelement vertex {len(table)}\n"
-    header += "".join(f"property {kind} {n}\n" for n in columns) + extra + "end_header\n"
-    body = table.tobytes()
-    path.write_bytes(header.encode() + body[: len(body) - cut])
+    views = np.array([(np.arange(3),)], dtype=[("view", object)])
+    camera = plyfile.PlyElement.describe(views, "camera", len_types={"view": "u1"}, val_types={"view": "i4"})
+    vertices = plyfile.PlyElement.describe(table, "vertex", comments=["by hand"])
+    plyfile.PlyData([vertices, camera], **layout).write(path)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -70,13 +67,14 @@ def test_plyfile_reads_what_is_written(tmp_path: Path) -> None:
         assert np.array_equal(vertex[name], value), name
 
 
-@pytest.mark.parametrize(("kind", "order"), [("float", "<"), ("double", "<"), ("float", ">")])
-def test_other_layouts_are_read(tmp_path: Path, kind: str, order: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "layout"), [("f4", {}), ("f8", {}), ("f4", {"byte_order": ">"}), ("f4", {"text": True})]
+)
+def test_other_layouts_are_read(tmp_path: Path, kind: str, layout: dict[str, object]) -> None:
     scene = random_scene(degree=2)
     columns = columns_of(scene)
     shuffled = {n: columns[n] for n in sorted(columns, reverse=True)} | {"confidence": np.ones(scene.count)}
-    extra = "element camera 1\nproperty list uchar int view\n"
-    write_ply(tmp_path / "other.ply", shuffled, kind=kind, order=order, extra=extra)
+    write_ply(tmp_path / "other.ply", shuffled, kind, **layout)
     back = load_scene(tmp_path / "other.ply", name="other name")
     assert back.name == "other name"
     for field in ("means", "log_scales", "quats", "opacity_logits", "sh"):
@@ -84,17 +82,14 @@ def test_other_layouts_are_read(tmp_path: Path, kind: str, order: str) -> None:
     assert back.simulated.all() and back.foreground.all() and not back.pinned.any()
 
 
-def test_text_is_read(tmp_path: Path) -> None:
-    scene = random_scene()
-    columns = columns_of(scene)
-    header = f"ply\nformat ascii 1.0\nelement vertex {scene.count}\n"
-    header += "".join(f"property float {n}\n" for n in columns) + "end_header\n"
-    rows = [" ".join(repr(float(c[i])) for c in columns.values()) for i in range(scene.count)]
-    (tmp_path / "text.ply").write_text(header + "\n".join(rows) + "\n")
-    assert torch.equal(load_scene(tmp_path / "text.ply").sh, scene.sh)
+def test_damaged_text_is_refused(tmp_path: Path) -> None:
+    save_scene(random_scene(), tmp_path / "good.ply", masks=False)
+    plyfile.PlyData(plyfile.PlyData.read(tmp_path / "good.ply").elements, text=True).write(tmp_path / "text.ply")
+    header, _, body = (tmp_path / "text.ply").read_text().partition("end_header\n")
+    rows = body.splitlines()
     for changed, needle in ((rows[:-1], "truncated"), (["1 2"] * 7, "truncated"), ([*rows, "1"], "7 of 'vertex'"),
                            (["x", *rows[1:]], "expected numbers")):  # fmt: skip
-        (tmp_path / "bad.ply").write_text(header + "\n".join(changed) + "\n")
+        (tmp_path / "bad.ply").write_text(header + "end_header\n" + "\n".join(changed) + "\n")
         refuse(tmp_path / "bad.ply", needle)
 
 
@@ -106,12 +101,15 @@ def refuse(path: Path, *needles: str) -> None:
 
 
 def test_counts_that_do_not_fit_the_data_are_refused(tmp_path: Path) -> None:
-    write_ply(tmp_path / "cut.ply", columns_of(random_scene()), cut=1)
-    refuse(tmp_path / "cut.ply", "truncated", "7 of 'vertex'")
-    (tmp_path / "header.ply").write_bytes((tmp_path / "cut.ply").read_bytes()[:60])
-    refuse(tmp_path / "header.ply", "end_header")
-    (tmp_path / "long.ply").write_bytes((tmp_path / "cut.ply").read_bytes() + b"\0" * 400)
-    refuse(tmp_path / "long.ply", "not what its header says")
+    path = tmp_path / "scene.ply"
+    save_scene(random_scene(), path)
+    good = path.read_bytes()
+    for bad, *needles in (
+        (good[:-1], "truncated", "7 of 'vertex'"), (good[:60], "end_header"),
+        (good + b"\0" * 400, "not what its header says"),
+    ):  # fmt: skip
+        path.write_bytes(bad)
+        refuse(path, *needles)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +130,7 @@ def test_wrong_values_and_properties_are_refused(tmp_path: Path, changed: dict, 
             del columns[name]
         else:
             columns[name][change[0]] = change[1]
-    write_ply(tmp_path / "bad.ply", columns, kind="double")
+    write_ply(tmp_path / "bad.ply", columns, "f8")
     refuse(tmp_path / "bad.ply", *needles)
 
 

@@ -1,22 +1,18 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from helpers.unit_motions import unit_motion, unit_scene
 from safetensors.torch import load_file, save_file
 
 from gausim.core import DataError, Trajectory
 from gausim.io.trajectory import FORMAT, load_trajectory, save_trajectory
 
 
-def trajectory(frames: int = 4, kernels: int = 7, units: int = 3) -> Trajectory:
-    generator = torch.Generator().manual_seed(0)
-    return Trajectory(
-        positions=torch.randn(frames, kernels, 3, generator=generator),
-        deformation_gradients=torch.randn(frames, units, 3, 3, generator=generator),
-        rotations=torch.randn(frames, units, 3, 3, generator=generator),
-        unit_of_kernel=torch.randint(0, units, (kernels,), generator=generator),
-        fps=30000 / 1001,
-    )
+def trajectory() -> Trajectory:
+    return replace(unit_motion(unit_scene(), frames=4, units=3), fps=30000 / 1001)
 
 
 def test_round_trip_is_bitwise(tmp_path):

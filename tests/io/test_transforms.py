@@ -8,25 +8,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.blob import ring_of_cameras
 
-from gausim.core import Cameras, DataError
+from gausim.core import DataError
 from gausim.io.transforms import read_transforms, write_transforms
 
-
-def two_cameras() -> Cameras:
-    a = 0.7
-    turned = torch.tensor([[math.cos(a), 0.0, -math.sin(a)], [0.0, 1.0, 0.0], [math.sin(a), 0.0, math.cos(a)]])
-    viewmats = torch.eye(4).repeat(2, 1, 1)
-    viewmats[1, :3, :3] = turned
-    viewmats[:, :3, 3] = torch.tensor([[0.1, 0.2, 3.0], [-0.4, 0.3, 2.5]])
-    k = torch.tensor([[30.0, 0.0, 10.0], [0.0, 31.0, 7.0], [0.0, 0.0, 1.0]])
-    return Cameras(viewmats, k.expand(2, 3, 3).clone(), 20, 16, ("a/0.png", "a/1.png"))
+CAMERAS = ring_of_cameras(("a/0.png", "a/1.png"), width=20, height=16)
+CAMERAS.viewmats[:, :3, 3] += torch.tensor([[0.1, 0.2, -1.0], [-0.4, 0.3, -1.5]])
+CAMERAS.Ks[:, 1, 2] = 7.0
 
 
 def written(tmp_path: Path, second: dict[str, object] | None = None, **changes: object) -> Path:
     """A file of two entries, the second with some fields of its own."""
     path = tmp_path / "transforms.json"
-    write_transforms(path, two_cameras(), [{"file_path": f"a/{i}.png", "camera": "a", "frame": i} for i in (0, 1)])
+    write_transforms(path, CAMERAS, [{"file_path": f"a/{i}.png", "camera": "a", "frame": i} for i in (0, 1)])
     data = json.loads(path.read_text())
     data["frames"][1].update(second or {})
     for key, value in changes.items():
@@ -40,8 +35,8 @@ def written(tmp_path: Path, second: dict[str, object] | None = None, **changes: 
 
 def test_written_cameras_are_read_back(tmp_path: Path) -> None:
     posed = read_transforms(written(tmp_path, fps=24))
-    torch.testing.assert_close(posed.cameras.viewmats, two_cameras().viewmats)
-    torch.testing.assert_close(posed.cameras.Ks, two_cameras().Ks)
+    torch.testing.assert_close(posed.cameras.viewmats, CAMERAS.viewmats)
+    torch.testing.assert_close(posed.cameras.Ks, CAMERAS.Ks)
     assert (posed.cameras.width, posed.cameras.height, posed.fps) == (20, 16, 24.0)
     assert [(f.camera, f.frame, f.path.name) for f in posed.frames] == [("a", 0, "0.png"), ("a", 1, "1.png")]
 
@@ -72,7 +67,7 @@ def test_blenders_own_layout(tmp_path: Path) -> None:
 
 
 def test_what_an_entry_says_itself_wins(tmp_path: Path) -> None:
-    assert read_transforms(written(tmp_path, second={"fl_x": 77.0})).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
+    assert read_transforms(written(tmp_path, second={"fl_x": 77.0})).cameras.Ks[:, 0, 0].tolist() == [9.0, 77.0]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.random_scene import random_scene
+from helpers.unit_motions import unit_motion
 
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.io import usd
@@ -19,15 +20,9 @@ pxr = pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
 
 
 def motion(rest: GaussianScene, frames: int = 4) -> list[GaussianScene]:
-    g, made = torch.Generator().manual_seed(1), [rest]
-    for _ in range(frames - 1):
-        deformation_gradients = torch.eye(3) + 0.2 * torch.randn(5, 3, 3, generator=g)
-        rotations = torch.linalg.qr(deformation_gradients)[0]
-        rotations = rotations * torch.det(rotations)[:, None, None].sign()
-        units = torch.randint(0, 5, (rest.count,), generator=g)
-        positions = rest.means + 0.1 * torch.randn(rest.means.shape, generator=g)
-        made.append(deformed_scene(rest, positions, deformation_gradients, rotations, units))
-    return made
+    made = unit_motion(rest, frames)
+    states = zip(made.positions, made.deformation_gradients, made.rotations, strict=True)
+    return [deformed_scene(rest, *state, made.unit_of_kernel) for state in states]
 
 
 @pytest.mark.parametrize(("suffix", "degree"), [(".usda", 0), (".usdc", 3), (".usd", 1)])

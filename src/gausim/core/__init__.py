@@ -33,8 +33,7 @@ if TYPE_CHECKING:
         trajectory_of,
     )
     from gausim.core.scene import GaussianScene
-    from gausim.core.smooth import SmoothMotions
-    from gausim.core.state import SimState, Trajectory
+    from gausim.core.state import SimState, SmoothMotions, Trajectory
     from gausim.core.surroundings import Floor, HandPath, HandPose, Surroundings
 
 __all__ = [
@@ -44,7 +43,7 @@ __all__ = [
     "Steppable", "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
 ]  # fmt: skip
 
-_LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state", "surroundings")
+_LATE = ("camera", "fitted", "protocols", "scene", "state", "surroundings")
 
 
 def __getattr__(name: str) -> Any:

@@ -87,13 +87,10 @@ class HandPath:
                 )
             centre = own.mean(1)
             offset = own - centre[:, None]
-            spread = torch.linalg.svdvals(offset[0]) if own.shape[1] > 2 else torch.zeros(3)
-            fixed = spread[1] > FLAT * spread[0]
-            turned = (
-                best_rotation(offset, offset[0])
-                if bool(fixed)
-                else torch.eye(3, dtype=own.dtype).expand(len(own), 3, 3)
-            )
+            turned = torch.eye(3, dtype=own.dtype).expand(len(own), 3, 3)
+            if own.shape[1] > 2:
+                spread = torch.linalg.svdvals(offset[0])
+                turned = best_rotation(offset, offset[0]) if spread[1] > FLAT * spread[0] else turned
             rotations.append(turned)
             centres.append(centre)
         return HandPath(torch.stack(rotations, 1).float(), torch.stack(centres, 1).float())

@@ -64,7 +64,7 @@ class ReadyDataModule(LightningDataModule):
             prefetch: number of batches that a process of its own reads ahead; 0 reads each when it is asked for.
             names: names of the objects to use; all when None.
             sequences: number of sequences per object to use, or their names; all when None.
-            test: the test part of the objects (:class:`gausim.data.reserved.ReservedPart`), in addition to what their
+            test: the test part of the objects (:class:`gausim.data.objects.ReservedPart`), in addition to what their
                 ``dataset.json`` declares.
         """
         super().__init__()

@@ -79,8 +79,9 @@ class ImageSource:
         posed = read_transforms(root / "transforms.json")
         if posed.fps is not None and posed.fps != fps:
             raise DataError(f"{posed.path}: field 'fps' is {posed.fps:g}, dataset.json says {fps:g}. Make them agree.")
-        self._frames, index = _frames_of_views(posed.path, posed.frames, views)
-        self.count = len(self._frames[0])
+        index = _frames_of_views(posed.path, posed.frames, views)
+        self._paths = [[posed.frames[i].path for i in row] for row in index]
+        self.count = len(index[0])
         _check_static(posed.path, posed.cameras, index, views)
         chosen = posed.cameras.select([row[0] for row in index])
         self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, tuple(views))
@@ -95,7 +96,7 @@ class ImageSource:
             DataError: an image is missing or malformed.
         """
         missing = [(f, v) for f in frames for v in columns if not self._decoded[f, v]]
-        paths = [self._frames[v][f].path for f, v in missing]
+        paths = [self._paths[v][f] for f, v in missing]
         read_rgba_into(paths, [self._pixels[f, v] for f, v in missing], (self.cameras.width, self.cameras.height))
         for f, v in missing:
             self._decoded[f, v] = True
@@ -103,13 +104,11 @@ class ImageSource:
 
     def absent(self) -> list[Path]:
         """Image files that are named but missing."""
-        return [frame.path for row in self._frames for frame in row if not frame.path.is_file()]
+        return [path for row in self._paths for path in row if not path.is_file()]
 
 
-def _frames_of_views(
-    path: Path, frames: Sequence[PosedFrame], views: Sequence[str]
-) -> tuple[list[list[PosedFrame]], list[list[int]]]:
-    """Entries and their indices, indexed as [view][frame]."""
+def _frames_of_views(path: Path, frames: Sequence[PosedFrame], views: Sequence[str]) -> list[list[int]]:
+    """Numbers of the entries, indexed as [view][frame]."""
     table: dict[str, dict[int, int]] = {view: {} for view in views}
     for i, frame in enumerate(frames):
         if frame.camera not in table:
@@ -126,8 +125,7 @@ def _frames_of_views(
                 f"{path}: view '{view}' lacks {count - len(row)} of {count} frames (first: {first}). "
                 "Restore them, or take the view out of dataset.json."
             )
-    index = [[table[view][f] for f in range(count)] for view in views]
-    return [[frames[i] for i in row] for row in index], index
+    return [[table[view][f] for f in range(count)] for view in views]
 
 
 def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: Sequence[str]) -> None:

@@ -26,16 +26,11 @@ def composite(
 
     The foreground mask is alpha > 0.
     """
-    rgb, alpha = over_black(frames)
+    values = frames.float() / 255
+    rgb, alpha = values[..., :3] * values[..., 3:], values[..., 3]
     if background is not None:
         rgb = rgb + (1 - alpha[..., None]) * background.to(rgb)
     return rgb, alpha
-
-
-def over_black(frames: UInt8[Tensor, "*B H W 4"]) -> tuple[Float[Tensor, "*B H W 3"], Float[Tensor, "*B H W"]]:
-    """RGB and alpha in [0, 1] of straight-alpha RGBA over black."""
-    values = frames.float() / 255
-    return values[..., :3] * values[..., 3:], values[..., 3]
 
 
 def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:

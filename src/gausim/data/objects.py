@@ -1,4 +1,4 @@
-"""One object of a data set: metadata, sequences, stills, true points and rest scene in one directory."""
+"""One object of a data set: metadata, sequences, stills, true points and rest scene in one directory; its test part."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_stills
-from gausim.data.reserved import reserved_part
 from gausim.data.surroundings import gripped, read_surroundings
 from gausim.io.npz import read_array
 from gausim.io.plain_json import checked, read_json
@@ -33,6 +32,44 @@ class _Facts(Struct):
     name: str = ""
 
 
+class ReservedPart(Struct, frozen=True, forbid_unknown_fields=True):
+    """Sequences that training sees only the seen frames of, as images; nothing is tuned on the others."""
+
+    sequences: tuple[str, ...] | Literal["all"] = "all"  # their names, or ``all``
+    # only objects made from one of these seeds (field ``seed`` of ``dataset.json``) have a test part; null: every
+    # object
+    seeds: tuple[int, ...] | None = None
+
+    def of(self, found: Sequence[str], seed: object, where: str) -> set[str]:
+        """The reserved ones of the sequences ``found`` of an object that was made from ``seed``.
+
+        Raises:
+            DataError: a reserved sequence does not exist.
+        """
+        if self.seeds is not None and seed not in self.seeds:
+            return set()
+        if self.sequences == "all":
+            return set(found)
+        absent = sorted(set(self.sequences) - set(found))
+        if absent:
+            raise DataError(
+                f"{where}: field 'test.sequences' reserves {absent}, the object has {list(found)}. Correct the names."
+            )
+        return set(self.sequences)
+
+
+def reserved_part(value: Mapping[str, Any] | None, where: str) -> ReservedPart | None:
+    """Reads a declaration; None if there is none.
+
+    Raises:
+        DataError: a field is unknown or wrong.
+    """
+    if value is None:
+        return None
+    remedy = "Expected {sequences: [NAME, ...] or all, seeds: [NUMBER, ...] or absent}."
+    return checked(dict(value) if isinstance(value, Mapping) else value, ReservedPart, where, remedy)
+
+
 class ObjectData:
     """A READY-like object directory (``dataset.json``, ``static/``, ``sequences/``, ``scene.ply``).
 
@@ -46,11 +83,8 @@ class ObjectData:
         train_frames: the frames that training may see, e.g. range(0, 16).
         facts: all other entries of ``dataset.json``.
         surroundings: what acts on the body besides its own elasticity.
-        scene_path: the rest scene's PLY file.
-        masks_path: its masks; None: the file beside the PLY.
-        selections: replacements of masks.
-        test: the test part that was given, in addition to that of ``dataset.json``.
-        sealed: whether the test part shows no more than the images of its seen frames.
+        scene_path, masks_path: files of the rest scene and its masks; without the second the one beside the PLY.
+        selections, test, sealed: as given.
     """
 
     def __init__(
@@ -72,7 +106,7 @@ class ObjectData:
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
-            test: the test part, in addition to that of ``dataset.json`` (:class:`gausim.data.reserved.ReservedPart`).
+            test: the test part, in addition to that of ``dataset.json`` (:class:`gausim.data.objects.ReservedPart`).
             sealed: refuse unseen frames and the true motion of the test part.
 
         Raises:
@@ -118,19 +152,14 @@ class ObjectData:
     @cached_property
     def sequences(self) -> list[SequenceRecord]:
         """The object's sequences in the order of their names."""
-        folder, found = self.root / "sequences", self.names
-        chosen = found
-        if isinstance(self._chosen, int):
-            chosen = found[: self._chosen]
-        elif self._chosen is not None:
-            chosen = list(self._chosen)
-        absent = [name for name in chosen if name not in found]
-        short = isinstance(self._chosen, int) and not 0 < self._chosen <= len(found)
-        if not chosen or absent or short:
-            raise DataError(
-                f"{folder}: sequences {self._chosen if self._chosen is not None else 'of any name'} "
-                f"asked for, it has {len(found)}: {found}."
-            )
+        folder, found, wanted = self.root / "sequences", self.names, self._chosen
+        if isinstance(wanted, int):
+            chosen = found[:wanted] if 0 < wanted <= len(found) else []
+        else:
+            chosen = found if wanted is None else list(wanted)
+        if not chosen or not set(chosen) <= set(found):
+            asked = "of any name" if wanted is None else wanted
+            raise DataError(f"{folder}: sequences {asked} asked for, it has {len(found)}: {found}.")
         records = [self.record(name) for name in chosen]
         for record in records:
             if record.count < self.train_frames.stop:

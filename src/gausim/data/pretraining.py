@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, SimState
-from gausim.data.corpus import Corpus, CorpusBody
+from gausim.data.corpus import BodyRecord, Corpus, CorpusBody
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample
@@ -44,16 +44,16 @@ class BodyData:
         sequences: its motions.
     """
 
-    def __init__(self, read: Any, name: str, fps: float, shape: tuple[int, int], seen: int) -> None:
-        """``read()`` returns the body; ``shape`` are the numbers of its sequences and of their frames."""
-        self._read, self.name, self.fps = read, name, fps
+    def __init__(self, read: Callable[[], CorpusBody], record: BodyRecord, seen: int) -> None:
+        """``read()`` returns the body of a record."""
+        self._read, self.name, self.fps = read, record.name, record.fps
         self.train_frames, self.train_views = range(seen), ()
-        self.sequences = [BodySequence(f"seq_{i:03d}", i, shape[1] - 1) for i in range(shape[0])]
+        self.sequences = [BodySequence(f"seq_{i:03d}", i, record.frames - 1) for i in range(record.sequences)]
 
     @property
     def body(self) -> CorpusBody:
         """The body as the corpus has it."""
-        return cast(CorpusBody, self._read())
+        return self._read()
 
     @property
     def rest_points(self) -> Float[Tensor, "K 3"]:
@@ -168,7 +168,7 @@ class CorpusDataModule(ReadyDataModule):
             raise ConfigError(
                 f"data.part, data.held_out: expected train or held_out and a number >= 1, got {part}, {held_out}."
             )
-        self._part, self._bodies, self._held_out, self.seen = part, bodies, held_out, seen
+        self._bodies, self._held_out, self.seen = bodies, held_out, seen
         self.knows_material = part == "train"
 
     @cached_property
@@ -179,8 +179,7 @@ class CorpusDataModule(ReadyDataModule):
                 "data.root: no corpus is given. Make one with `gausim prepare corpus`, set data.root=DIR."
             )
         corpus = Corpus(Path(str(self._root)))
-        first = len(corpus) - self._held_out
-        self.trainable = first
+        self.trainable = first = len(corpus) - self._held_out
         wanted = first if self._bodies is None else self._bodies
         if not 1 <= wanted <= first:
             raise ConfigError(
@@ -190,7 +189,7 @@ class CorpusDataModule(ReadyDataModule):
         chosen = [*(range(wanted) if self.knows_material else ()), *range(first, len(corpus))]
         self.curriculum.see(self.seen)
         read = lru_cache(BODIES_IN_MEMORY)(corpus.body)
-        return [_body_data(corpus, read, i, self.seen) for i in chosen]
+        return [BodyData(partial(read, i), corpus.manifest.bodies[i], self.seen) for i in chosen]
 
     @cached_property
     def index(self) -> CorpusIndex:
@@ -214,8 +213,3 @@ class CorpusDataModule(ReadyDataModule):
         count, (sequences, _) = len(self.objects) - self._held_out, self.trained()
         known = f"{count} bodies of known material" if self.knows_material else "bodies of unknown material"
         return [f"{self._root}: {known}, {sequences} sequences; {self._held_out} bodies held out"]
-
-
-def _body_data(corpus: Corpus, read: Any, number: int, seen: int) -> BodyData:
-    facts = corpus.manifest.bodies[number]
-    return BodyData(lambda: read(number), facts.name, facts.fps, (facts.sequences, facts.frames), seen)

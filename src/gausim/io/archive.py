@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO
+from typing import Any
 
 from gausim.core.errors import DataError, FetchError
 from gausim.io.files import replacing
@@ -44,16 +44,15 @@ def files_below(root: Path) -> list[Path]:
         DataError: the folder contains a link or a device, which archives do not support.
     """
     found = []
-    for folder, folders, names in os.walk(root):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in [*folders, *sorted(name for name in names if not name.startswith("."))]:
-            path = Path(folder) / name
-            mode = path.lstat().st_mode
-            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                raise DataError(f"{path}: expected a file or a folder, found a link or a device. Put a copy there.")
-            if stat.S_ISREG(mode):
-                found.append(path)
-    return sorted(found)
+    for path in sorted(root.rglob("*")):
+        if any(part.startswith(".") for part in path.relative_to(root).parts):
+            continue
+        mode = path.lstat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise DataError(f"{path}: expected a file or a folder, found a link or a device. Put a copy there.")
+        if stat.S_ISREG(mode):
+            found.append(path)
+    return found
 
 
 def pack(target: Path, files: Mapping[str, Path]) -> int:
@@ -85,26 +84,26 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int, advance: Callable[[i
         OSError: writing to the disk failed.
     """
     folder.mkdir(parents=True)
+    room, taken = most_bytes, dict[str, bool]()
     try:
-        _unpack(archive, folder, most_bytes, advance)
+        for member in _members(archive):
+            place = _place(archive, member, taken)
+            if place is None:
+                continue
+            room -= member.size
+            if room < 0 or member.size < 0:
+                raise _unsafe(archive, member.name, f"more than the {most_bytes} bytes that were announced")
+            _write(member, folder / place, advance)
     except BaseException as error:
         remove_tree(folder)
         # An OSError with a number is from the disk, one without from gzip or bzip2.
         if isinstance(error, _DAMAGE) or (isinstance(error, OSError) and error.errno is None):
-            raise _damaged(archive, error) from error
+            said = (str(error) or type(error).__name__).splitlines()[0]
+            raise FetchError(
+                f"{archive.name}: expected a tar or zip archive, found one that is damaged or another file ({said}). "
+                "Nothing of it was kept. Tell whoever published it."
+            ) from error
         raise
-
-
-def _unpack(archive: Path, folder: Path, most_bytes: int, advance: Callable[[int], None] | None) -> None:
-    room, taken = most_bytes, dict[str, bool]()
-    for member in _members(archive):
-        place = _place(archive, member, taken)
-        if place is None:
-            continue
-        room -= member.size
-        if room < 0 or member.size < 0:
-            raise _unsafe(archive, member.name, f"more than the {most_bytes} bytes that were announced")
-        _write(archive, member, folder / place, advance)
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ class _Member:
     name: str
     size: int
     kind: str
-    open: Callable[[], IO[bytes] | None]
+    open: Callable[[], Any]  # the stream of a file
 
 
 def _members(archive: Path) -> Iterator[_Member]:
@@ -168,18 +167,15 @@ def _place(archive: Path, member: _Member, taken: dict[str, bool]) -> PurePosixP
     return path
 
 
-def _write(archive: Path, member: _Member, path: Path, advance: Callable[[int], None] | None) -> None:
+def _write(member: _Member, path: Path, advance: Callable[[int], None] | None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    source = member.open()
     left = member.size
-    with path.open("xb") as target:
-        while source is not None and (chunk := source.read(_CHUNK)):
+    with member.open() as source, path.open("xb") as target:
+        while chunk := source.read(_CHUNK):
             target.write(chunk)
             left -= len(chunk)
             if advance is not None:
                 advance(len(chunk))
-    if source is not None:
-        source.close()
     if left:
         raise EOFError(f"{member.name!r} has {member.size - left} bytes of {member.size}")
 
@@ -188,14 +184,6 @@ def _unsafe(archive: Path, name: str, what: str) -> FetchError:
     return FetchError(
         f"{archive.name}: {name[:120]!r} is {what}; expected plain files and folders below one folder. Nothing of the "
         "archive was kept. Do not use it, and tell whoever published it."
-    )
-
-
-def _damaged(archive: Path, error: BaseException) -> FetchError:
-    said = (str(error) or type(error).__name__).splitlines()[0]
-    return FetchError(
-        f"{archive.name}: expected a tar or zip archive, found one that is damaged or another file ({said}). Nothing "
-        "of it was kept. Tell whoever published it."
     )
 
 

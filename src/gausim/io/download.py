@@ -62,41 +62,39 @@ def continue_download(address: str, part: Path, *, size: int, advance: Callable[
         if have > size:
             part.unlink()
             continue
-        broken = _append(address, part, have, size, advance)
-        if broken is None:
-            continue
-        tries += 1
-        final = isinstance(broken, urllib.error.HTTPError) and broken.code < 500 and broken.code not in (408, 416, 429)
-        if final or not is_url(address) or tries == ATTEMPTS:
-            raise _unreadable(address, broken, kept=_length(part)) from broken
-        time.sleep(PAUSE * 2 ** (tries - 1))
+        try:
+            _append(address, part, have, size, advance)
+        except _BROKEN as error:
+            tries, final = tries + 1, not is_url(address)
+            if isinstance(error, urllib.error.HTTPError):
+                error.close()
+                final = error.code < 500 and error.code not in (408, 416, 429)
+                if error.code == 416:  # range not satisfiable: restart the download
+                    part.unlink(missing_ok=True)
+            if final or tries == ATTEMPTS:
+                raise _unreadable(address, error, kept=_length(part)) from error
+            time.sleep(PAUSE * 2 ** (tries - 1))
     advance(size)
 
 
-def _append(address: str, part: Path, have: int, size: int, advance: Callable[[int], None]) -> Exception | None:
-    """Appends the bytes of one connection; returns the error that ended it, if any."""
+def _append(address: str, part: Path, have: int, size: int, advance: Callable[[int], None]) -> None:
+    """Appends the bytes of one connection; raises a ``ConnectionError`` where it ends too early."""
     other = "It is another file: tell whoever keeps the registry."
-    try:
-        stream, start, total = _opened(address, have)
-        with stream:
-            if total not in (None, size):
-                raise FetchError(f"{address}: expected {size} bytes, as the registry says, found {total}. {other}")
-            with part.open("r+b" if start else "wb") as file:
-                file.seek(start)
-                while chunk := stream.read(min(_CHUNK, size + 1 - file.tell())):
-                    file.write(chunk)
-                    advance(file.tell())
-                done = file.tell()
-    except _BROKEN as error:
-        if isinstance(error, urllib.error.HTTPError):
-            error.close()
-            if error.code == 416:  # range not satisfiable: restart the download
-                part.unlink(missing_ok=True)
-        return error
+    stream, start, total = _opened(address, have)
+    with stream:
+        if total not in (None, size):
+            raise FetchError(f"{address}: expected {size} bytes, as the registry says, found {total}. {other}")
+        with part.open("r+b" if start else "wb") as file:
+            file.seek(start)
+            while chunk := stream.read(min(_CHUNK, size + 1 - file.tell())):
+                file.write(chunk)
+                advance(file.tell())
+            done = file.tell()
     if done > size:
         part.unlink()
         raise FetchError(f"{address}: expected {size} bytes, as the registry says, found more. {other}")
-    return None if done == size else ConnectionError(f"the connection ended after {done} of {size} bytes")
+    if done < size:
+        raise ConnectionError(f"the connection ended after {done} of {size} bytes")
 
 
 def _opened(address: str, offset: int) -> tuple[BufferedIOBase, int, int | None]:

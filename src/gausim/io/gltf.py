@@ -225,12 +225,11 @@ def linear_scene(
     means: np.ndarray, scales: np.ndarray, quats: np.ndarray, opacities: np.ndarray, sh: np.ndarray, name: str
 ) -> GaussianScene:
     """A scene of linear scales, quaternions x y z w and opacities in [0, 1], as glTF and USD hold them."""
-    inside = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
     return GaussianScene.create(
         means=torch.from_numpy(means.copy()),
         log_scales=torch.from_numpy(scales.copy()).log(),
         quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
-        opacity_logits=torch.from_numpy(np.log(inside / (1 - inside)).astype(np.float32)),
+        opacity_logits=torch.from_numpy(opacities.astype(np.float64)).logit(_EDGE).float(),
         sh=torch.from_numpy(sh),
         name=name,
     )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import msgspec
 import numpy as np
 import torch
@@ -164,13 +165,11 @@ def write_packed(
 
 def bounding_crop(alpha: UInt8[np.ndarray, "F H W"], margin: int, offset: int) -> Crop:
     """The bounding box of all pixels with alpha > 0 in any frame, enlarged by ``margin`` pixels."""
-    touched = np.asarray(np.any(alpha > 0, axis=0))
-    if not touched.any():
+    x, y, width, height = cv2.boundingRect(np.any(alpha > 0, axis=0).astype(np.uint8))
+    if not width:
         return Crop(0, 0, 0, 0, offset)
-    rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
-    top, left = max(0, int(rows[0]) - margin), max(0, int(columns[0]) - margin)
-    bottom = min(touched.shape[0], int(rows[-1]) + 1 + margin)
-    right = min(touched.shape[1], int(columns[-1]) + 1 + margin)
+    left, top = max(0, x - margin), max(0, y - margin)
+    bottom, right = min(alpha.shape[1], y + height + margin), min(alpha.shape[2], x + width + margin)
     return Crop(left, top, right - left, bottom - top, offset)
 
 

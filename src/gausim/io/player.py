@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from jinja2 import Template
 from torch import Tensor
 
 from gausim.core import Cameras, GaussianScene, Trajectory
@@ -42,15 +43,13 @@ def save_player(
         "background": [0.0, 0.0, 0.0] if background is None else background.tolist(),
     }
     folder = files("gausim.io")
-    parts = {
-        "settings": json.dumps(settings),
-        "script": folder.joinpath("player.js").read_text(encoding="utf-8"),
-        "motion": base64.b64encode(motion_glb(scene, trajectory, up=up).to_bytes()).decode(),
-        "title": html.escape(f"{scene.name} - gausim"),  # last: it could hold the marks of the others
-    }
-    page = folder.joinpath("player.html").read_text(encoding="utf-8")
-    for name, text in parts.items():
-        page = page.replace("{{ " + name + " }}", text, 1)
+    template = Template(folder.joinpath("player.html").read_text(encoding="utf-8"), keep_trailing_newline=True)
+    page = template.render(
+        settings=json.dumps(settings),
+        script=folder.joinpath("player.js").read_text(encoding="utf-8"),
+        motion=base64.b64encode(motion_glb(scene, trajectory, up=up).to_bytes()).decode(),
+        title=html.escape(f"{scene.name} - gausim"),
+    )
     write_durably(Path(path), page.encode())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,21 +35,17 @@ class Element:
         """The fields that are lists."""
         return [name for name, (_, counter) in self.fields.items() if counter]
 
-    def layout(self, lengths: Mapping[str, int]) -> np.dtype:
-        """Memory layout of one whose lists have these lengths, up to the first list without."""
-        parts: list[Any] = []
-        for name, (kind, counter) in self.fields.items():
-            parts += [(f"number of {name}", counter)] if counter else []
-            if counter and name not in lengths:
-                break
-            parts.append((name, kind, (lengths[name],) if counter else ()))
-        return np.dtype(parts)
+    @property
+    def row(self) -> np.dtype:
+        """Memory layout of one without lists."""
+        return np.dtype([(name, kind) for name, (kind, _) in self.fields.items()])
 
 
 def read_elements(path: Path) -> Iterator[tuple[Element, Any]]:
     """The elements of a file in their order, each with its columns by name; numbers of a text are float64.
 
-    The columns are fields of one structured array, or lists where the lists of an element differ in length.
+    The columns are fields of one structured array, or arrays of their own of an element with lists; they are lists
+    themselves where these lists differ in length.
 
     Raises:
         DataError: the file is missing, no PLY file, cut off, or longer than its header says.
@@ -62,7 +58,7 @@ def read_elements(path: Path) -> Iterator[tuple[Element, Any]]:
     for element in elements:
         columns, at = _take(path, element, body, at)
         # Some writers end with a line break; room for one thing more means that the number of things is wrong.
-        least = 1 if text else element.layout({}).itemsize
+        least = 1 if text else element.row.itemsize
         if element is elements[-1] and not element.lists and len(body) - at >= least:
             raise DataError(
                 f"{path}: has {len(body) - at} bytes after {element.count} of '{element.name}'. It is not what its "
@@ -136,36 +132,31 @@ def _take(path: Path, element: Element, body: memoryview, at: int) -> tuple[Any,
     """The columns of an element whose data begin at a byte, and where they end."""
     if not element.count:
         return {name: np.zeros(0) for name in element.fields}, at
-    layout = _layout(path, element, body, at)
-    end = at + layout.itemsize * element.count
-    if end <= len(body):
-        rows = np.frombuffer(body, layout, element.count, at)
-        if all((rows[f"number of {name}"] == rows[name].shape[1]).all() for name in element.lists):
-            return rows, end
     if not element.lists:
-        raise _truncated(path, element, len(body) - at)
+        rows = _values(path, element, body, at, element.row, element.count)
+        return rows, at + rows.nbytes
     found: dict[str, list[Any]] = {name: [] for name in element.fields}
     for _ in range(element.count):
-        row = np.frombuffer(body, layout := _layout(path, element, body, at), 1, at)[0]
-        at += layout.itemsize
-        for name, values in found.items():
-            values.append(row[name])
-    return found, at
+        for name, (kind, counter) in element.fields.items():
+            length = 1
+            if counter:
+                stated = float(_values(path, element, body, at, np.dtype(counter), 1)[0])
+                if not (stated.is_integer() and 0 <= stated <= len(body)):
+                    raise DataError(
+                        f"{path}: list '{name}' of '{element.name}' has length {stated:g}. Export it again."
+                    )
+                length, at = int(stated), at + np.dtype(counter).itemsize
+            values = _values(path, element, body, at, np.dtype(kind), length)
+            found[name].append(values if counter else values[0])
+            at += values.nbytes
+    return {name: np.array(v) if len(set(map(np.size, v))) == 1 else v for name, v in found.items()}, at
 
 
-def _layout(path: Path, element: Element, body: memoryview, at: int) -> np.dtype:
-    """Memory layout of the thing at a byte, all of which is there."""
-    lengths = dict[str, int]()
-    for name in (*element.lists, None):
-        layout = element.layout(lengths)
-        if at + layout.itemsize > len(body):
-            raise _truncated(path, element, len(body) - at)
-        if name is not None:
-            length = float(np.frombuffer(body, layout, 1, at)[0][f"number of {name}"])
-            if not (length.is_integer() and 0 <= length <= len(body)):
-                raise DataError(f"{path}: list '{name}' of '{element.name}' has length {length:g}. Export it again.")
-            lengths[name] = int(length)
-    return layout
+def _values(path: Path, element: Element, body: memoryview, at: int, dtype: np.dtype, count: int) -> np.ndarray:
+    """Numbers or rows of an element that begin at a byte, all of which are there."""
+    if at + count * dtype.itemsize > len(body):
+        raise _truncated(path, element, len(body) - at)
+    return np.frombuffer(body, dtype, count, at)
 
 
 def _truncated(path: Path, element: Element, left: int) -> DataError:

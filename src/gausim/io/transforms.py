@@ -62,7 +62,12 @@ def read_transforms(path: Path) -> PosedImages:
     for field, entry in read_entries(data, path):
         fields = {**data, **entry}
         frames.append(_frame(path.parent, entry, field))
-        here = size_field(fields, field) or size or _size_of(frames[-1].path, field)
+        here = size_field(fields, field) or size
+        if here is None:
+            found = read_header(frames[-1].path)
+            if found is None:
+                raise DataError(f"{field}: has no 'w' and 'h', and {frames[-1].path} cannot be read to find them.")
+            here = found.width, found.height
         size = size or here
         if here != size:
             raise DataError(f"{field}: is {here[0]}x{here[1]}, frames[0] is {size[0]}x{size[1]}; use one image size.")
@@ -163,13 +168,6 @@ def size_field(fields: dict[str, Any], field: str) -> tuple[int, int] | None:
     if min(size) < 1:
         raise DataError(f"{field}: fields 'w', 'h' must be positive, got {size}.")
     return size
-
-
-def _size_of(image: Path, field: str) -> tuple[int, int]:
-    found = read_header(image)
-    if found is None:
-        raise DataError(f"{field}: has no 'w' and 'h', and {image} cannot be read to find them.")
-    return found.width, found.height
 
 
 def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:

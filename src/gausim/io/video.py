@@ -30,7 +30,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, q
         DataError: no frames, frames of different size or type, or the encoder fails.
     """
     path = Path(path)
-    first, frames = _peek(path, frames)
+    checked = _checked(path, frames)
+    first = next(checked)
     height, width = (n + n % 2 for n in first.shape[:2])
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -39,8 +40,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, q
             stream = container.add_stream(H264, rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.options = {"crf": str(quality), "preset": "medium"}
-            for pixels in frames:
-                _check(path, pixels, first.shape)
+            for pixels in chain([first], checked):
                 padded = np.pad(pixels, ((0, height - len(pixels)), (0, width - pixels.shape[1]), (0, 0)), mode="edge")
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(padded), format="rgb24")
                 container.mux(stream.encode(frame))
@@ -101,11 +101,7 @@ def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int
     from PIL import Image
 
     path = Path(path)
-    first, frames = _peek(path, frames)
-    images = []
-    for pixels in frames:
-        _check(path, pixels, first.shape)
-        images.append(Image.fromarray(pixels))
+    images = [Image.fromarray(pixels) for pixels in _checked(path, frames)]
     # One palette, computed from all frames, avoids flicker between palettes.
     step = max(1, len(images) // 8)
     overview = Image.fromarray(np.concatenate([np.asarray(i) for i in images[::step]], axis=1))
@@ -117,17 +113,15 @@ def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int
     return len(indexed)
 
 
-def _peek(path: Path, frames: Iterable[np.ndarray]) -> tuple[np.ndarray, Iterator[np.ndarray]]:
-    iterator = iter(frames)
-    first = next(iterator, None)
-    if first is None:
+def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The frames, each after a check that it is an RGB image of the first one's size; at least one."""
+    shape = None
+    for pixels in frames:
+        shape = shape or pixels.shape
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.shape != shape:
+            raise DataError(
+                f"{path}: expected uint8 RGB frames of one size (first {shape}), got {pixels.dtype} {pixels.shape}."
+            )
+        yield pixels
+    if shape is None:
         raise DataError(f"{path}: no frames to write; a video needs at least one.")
-    _check(path, first, first.shape)
-    return first, chain([first], iterator)
-
-
-def _check(path: Path, pixels: np.ndarray, shape: tuple[int, ...]) -> None:
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.shape != shape:
-        raise DataError(
-            f"{path}: expected uint8 RGB frames of one size (first {shape}), got {pixels.dtype} {pixels.shape}."
-        )
