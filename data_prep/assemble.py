@@ -9,6 +9,7 @@ with the scene of `select` it is complete, and is checked as `gausim verify` doe
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -122,10 +123,7 @@ def _checked(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _length(frames: Sequence[Any]) -> int:
     """Frames of the camera that has the fewest."""
-    counts: dict[str, int] = {}
-    for frame in frames:
-        counts[frame.camera] = counts.get(frame.camera, 0) + 1
-    return min(counts.values())
+    return min(Counter(frame.camera for frame in frames).values())
 
 
 def _scene_files(scene: Path) -> dict[str, Path]:

@@ -8,7 +8,6 @@ picture by picture; the same settings give the same bytes.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -77,7 +76,7 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     plan = replace(plan, **given(Plan, arguments), pictures=pictures, soft=soft)
     out, folder = arguments.out or Path("data") / plan.name, arguments.blender_env or default_environment()
     manifest = make_set(
-        arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python, folder, say=_say),
+        arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python, folder),
         workers=max(1, arguments.workers), force=arguments.force, tick=tick,
     )  # fmt: skip
     told = manifest["results"]
@@ -85,7 +84,3 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
         f"{headline(out, manifest)}: {len(told['sequences'])} sequences, {told['images']} pictures by Blender "
         f"{told['blender']['bpy']} ({time.monotonic() - began:.0f} s)"
     )
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_prep.capture.cameras.sources import factors, match_matrices, read_matrix
+from data_prep.capture.cameras.sources import factors, match_matrices
 from data_prep.capture.cameras.world import compare
 from data_prep.common.command import run_command, stage_parser
 from data_prep.common.photos import list_images
@@ -37,7 +37,7 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
         if images is None:
             raise
         found = match_matrices(path, list_images(images))
-        return _by_stem({photo.name: factors(read_matrix(m), str(m))[1] for photo, m in found.items()}, path)
+        return _by_stem({photo.name: factors(m)[1] for photo, m in found.items()}, path)
     return _by_stem({image.name: image.viewmat for image in read_colmap(folder).images}, path)
 
 

@@ -19,8 +19,7 @@ import msgspec
 from safetensors.numpy import load_file, save
 
 from data_prep.common.command import add_options, chosen, cores, headline, run_command, stage_parser
-from data_prep.common.pool import each
-from data_prep.common.progress import Tick, silent
+from data_prep.common.progress import Tick, each, silent
 from data_prep.common.stage import Stage, run_stage
 from data_prep.random_bodies.plan import Plan
 from gausim.core.errors import ConfigError

@@ -21,7 +21,7 @@ import numpy as np
 
 from data_prep.capture.films.film import Film, pictures, probe, upright
 from data_prep.capture.films.sheet import write_sheet
-from data_prep.capture.films.sync import Alignment, Offsets, align, facts, measure
+from data_prep.capture.films.sync import METHODS, Alignment, align, facts, measure
 from data_prep.capture.films.takes import Take, find_takes, offset_seconds
 from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
 from data_prep.common.photos import reduced, write_image
@@ -32,7 +32,6 @@ from gausim.io.files import write_json
 
 # Raise when the same films and settings give other frames than before.
 REVISION = 1
-METHODS = ("auto", "timecode", "audio", "flash", "offsets")
 # PNG's effort: 1 is three times as fast as the default and 10 % larger.
 COMPRESSION = 1
 THUMBNAIL = 64
@@ -57,7 +56,7 @@ def _offsets(text: str) -> dict[str, str]:
 class IngestOptions(Options):
     """Settings of synchronisation and of the frames that are written."""
 
-    sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=METHODS)
+    sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=("auto", *METHODS))
     offsets: Mapping[str, str] | None = option(
         None, "how much later cameras began: seconds, or 7.3f in frames; for sequences that state none",
         type=_offsets, metavar="CAM=X,CAM=X",
@@ -139,7 +138,19 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
     """
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:
-        offsets, alignment = _placed(take, films, options)
+        given = {}
+        for name, text in (take.offsets or options.offsets or {}).items():
+            camera = _camera(name, take, "offsets")
+            given[camera] = offset_seconds(text, float(films[camera].rate))
+        offsets = measure(films, options.sync, given=given, shutter=options.shutter)
+        alignment = align(
+            films,
+            offsets,
+            rate=Fraction(options.fps) if options.fps else None,
+            reference=_camera(options.reference, take, "reference") if options.reference else None,
+            start=options.start if take.start is None else take.start,
+            duration=options.duration if take.duration is None else take.duration,
+        )
     except DataError as error:
         raise DataError(f"sequence '{take.source}': {error}") from error
     found = {
@@ -150,23 +161,6 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
         },
     }  # fmt: skip
     return films, alignment, found
-
-
-def _placed(take: Take, films: Mapping[str, Film], options: IngestOptions) -> tuple[Offsets, Alignment]:
-    given = {}
-    for name, text in (take.offsets or options.offsets or {}).items():
-        camera = _camera(name, take, "offsets")
-        given[camera] = offset_seconds(text, float(films[camera].rate))
-    offsets = measure(films, options.sync, given=given, shutter=options.shutter)
-    alignment = align(
-        films,
-        offsets,
-        rate=Fraction(options.fps) if options.fps else None,
-        reference=_camera(options.reference, take, "reference") if options.reference else None,
-        start=options.start if take.start is None else take.start,
-        duration=options.duration if take.duration is None else take.duration,
-    )
-    return offsets, alignment
 
 
 def _camera(name: str, take: Take, what: str) -> str:
@@ -191,15 +185,13 @@ def _write_camera(
     film: Film, indices: np.ndarray, folder: Path, max_side: int | None, done: Callable[[int], None]
 ) -> list[np.ndarray]:
     """Writes the frames of one camera that are not there yet; returns a small grey picture of each."""
-    places: dict[int, list[int]] = {}
-    for place, index in enumerate(indices):
-        places.setdefault(int(index), []).append(place)
     small: dict[int, np.ndarray] = {}
     for index, frame in pictures(film):
-        if index not in places:
+        places = np.flatnonzero(indices == index)
+        if not len(places):
             continue
         pixels = reduced(cv2.cvtColor(upright(film, frame), cv2.COLOR_RGB2BGR), max_side)
-        for place in places[index]:
+        for place in places.tolist():
             path = folder / f"{place:04d}.png"
             if not path.is_file():
                 write_image(path, pixels, COMPRESSION)

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import argparse
 import shutil
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from data_prep.capture.cameras.mapping import SCRATCH, MappingOptions, map_photos
-from data_prep.capture.cameras.material import Material, Sources
 from data_prep.capture.cameras.output import PosedWriter, key_of, sequence_cameras, write_points
 from data_prep.capture.cameras.report import draw_cameras, failures, point_colors, reprojection
-from data_prep.capture.cameras.sources import Posed, from_model
-from data_prep.capture.cameras.world_options import WorldOptions, place
+from data_prep.capture.cameras.sources import Material, Posed, Sources, from_model
+from data_prep.capture.cameras.world import WorldOptions, place
 from data_prep.common.command import add_options, chosen, headline, run_command, stage_parser
 from data_prep.common.photos import list_images, open_photo
 from data_prep.common.progress import Tick, silent
@@ -79,7 +79,7 @@ def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldO
     stills = [shot for shot in moved if key_of(shot.photo.name) not in used] or moved
     writer.stills(work, stills)
     xyz = move.points(points.xyz)
-    colors = points.rgb if material.coloured else point_colors(found, points)
+    colors = point_colors(found, points) if material.posed is None else points.rgb
     write_points(work / "points.npz", points, xyz, colors)
     with replacing(work / "cameras.png", typed=True) as temporary:
         draw_cameras(temporary, moved, xyz, colors, f"{len(moved)} cameras, {len(xyz)} points")
@@ -130,28 +130,25 @@ def _map(
             photo = open_photo(first, f"{folder.name}/{name}{first.suffix}")
             photos.append(photo)
             cameras[photo.name] = name
-    mapped = map_photos(photos, cameras, work, options, tick)
-    model = read_colmap(mapped.folder)
+    folder, features, matches, others = map_photos(photos, cameras, work, options, tick)
+    model = read_colmap(folder)
     found = from_model(model, {photo.name: photo for photo in photos})
     results = {
         "images": len(photos),
         "registered": len(found),
-        "failed": failures(photos, found, mapped.features, mapped.matches),
-        "other_models": list(mapped.others),
+        "failed": failures(photos, found, features, matches),
+        "other_models": others,
     }
     return found, model.points, results
 
 
 def _lenses(found: list[Posed]) -> list[dict[str, Any]]:
     """The different lenses with the number of their photos."""
-    lenses: list[dict[str, Any]] = []
-    for camera in (shot.camera for shot in found):
-        lens = {"model": camera.model, "width": camera.width, "height": camera.height, "params": camera.params.tolist()}
-        same = next((known for known in lenses if known | lens == known), None)
-        if same is None:
-            lenses.append(same := {**lens, "photos": 0})
-        same["photos"] += 1
-    return lenses
+    counts = Counter((c.model, c.width, c.height, tuple(c.params.tolist())) for c in (shot.camera for shot in found))
+    return [
+        {"model": model, "width": width, "height": height, "params": list(params), "photos": photos}
+        for (model, width, height, params), photos in counts.items()
+    ]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -34,7 +34,11 @@ def reconstruct(root: Path, out: Path, arguments: argparse.Namespace, *, force: 
         DataError: images, poses, masks or points are unusable.
         SceneError: the pins select no kernel.
     """
-    source = _source(root)
+    source = next((root / name for name in ("dataset.json", "transforms.json") if (root / name).is_file()), None)
+    if source is None:
+        raise DataError(
+            f"{root}: neither dataset.json nor transforms.json is here. Expected what `segment` or `poses` wrote."
+        )
     settings = {key: value for key, value in vars(arguments).items() if key not in _OUTSIDE}
     settings = {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()}
     stage = Stage("reconstruct", REVISION, _files(source, arguments), settings, PACKAGES)
@@ -43,15 +47,6 @@ def reconstruct(root: Path, out: Path, arguments: argparse.Namespace, *, force: 
         return fit_scene(source, work / "scene.ply", arguments)[0]
 
     return run_stage(stage, out, make, force=force)
-
-
-def _source(root: Path) -> Path:
-    for name in ("dataset.json", "transforms.json"):
-        if (root / name).is_file():
-            return root / name
-    raise DataError(
-        f"{root}: neither dataset.json nor transforms.json is here. Expected what `segment` or `poses` wrote."
-    )
 
 
 def _files(source: Path, arguments: argparse.Namespace) -> dict[str, Path]:

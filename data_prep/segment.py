@@ -12,19 +12,19 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from data_prep.capture.films.film import probe
-from data_prep.capture.masks.cleanup import Cleanup, cleaned, matte, overlap, steady
+from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup, cleaned, matte, overlap, steady
 from data_prep.capture.masks.clips import Clip, film_frames, find_clips, is_film, read_picture, write_picture
-from data_prep.capture.masks.options import BACKENDS, GROUPS, add_segment_options, make_backend, make_cleanup
+from data_prep.capture.masks.options import BACKENDS, GROUPS, make_backend
 from data_prep.capture.masks.overlays import write_overlays
-from data_prep.capture.masks.segmenters import Backend, MaskOf, Segmenter
-from data_prep.common.command import chosen, headline, run_command, stage_parser
+from data_prep.capture.masks.segmenters import Backend, MaskOf
+from data_prep.common.command import add_options, chosen, given, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import MANIFEST, Stage, copy_missing, read_manifest, run_stage
 from gausim.core.errors import ConfigError, DataError
@@ -62,19 +62,13 @@ def segment(
     clips = [] if film else find_clips(source, kind=kind, every=every)
     pictures = {path.as_posix(): source / path for clip in clips for path in clip.paths}
     carried = {} if film or every > 1 else _beside(source)
-    stage = Stage(
-        name="segment",
-        revision=REVISION,
-        inputs={
-            **({source.name: source} if film else {**pictures, **carried}),
-            **{f"backend/{k}": v for k, v in backend.inputs.items()},
-        },
-        settings={
-            **{"backend": backend.name, **backend.settings},
-            **{"cleanup": asdict(cleanup), "kind": kind, "every": every},
-        },
-        packages=("av", "numpy", "opencv-python-headless", *backend.packages),
-    )
+    inputs = {source.name: source} if film else {**pictures, **carried}
+    inputs |= {f"backend/{name}": path for name, path in backend.inputs.items()}
+    settings = {
+        "backend": backend.name, **backend.settings, "cleanup": asdict(cleanup), "kind": kind, "every": every,
+    }  # fmt: skip
+    packages = ("av", "numpy", "opencv-python-headless", *backend.packages)
+    stage = Stage("segment", REVISION, inputs, settings, packages)
 
     def make(work: Path) -> dict[str, Any]:
         found = clips
@@ -92,12 +86,11 @@ def segment(
 
 
 class _Run:
-    """One run over all clips; the segmenter is made when the first mask is missing."""
+    """One run over all clips."""
 
     def __init__(self, work: Path, backend: Backend, cleanup: Cleanup, fps: float, tick: Tick) -> None:
         self._work, self._backend, self._cleanup, self._fps = work, backend, cleanup, fps
         self._tick = tick
-        self._segmenter: Segmenter | None = None
 
     def clip(self, clip: Clip) -> dict[str, Any]:
         """Makes a clip's files; its figures, written last, say that it is complete."""
@@ -118,8 +111,7 @@ class _Run:
         for i in range(len(clip)):
             path = self._raw(clip, i)
             if not path.is_file():
-                self._segmenter = self._segmenter or self._backend.make()
-                mask_of = mask_of or self._segmenter.open(clip)
+                mask_of = mask_of or self._backend.open(clip)
                 mask = _checked(mask_of(i), clip, i, self._backend.name)
                 write_picture(path, np.round(mask * 255).astype(np.uint8))
             self._tick(clip.name, i + 1, len(clip))
@@ -141,10 +133,9 @@ class _Run:
             mask = steady(mask, [(abs(j - i), raw(j)) for j in around], self._cleanup.motion * max(mask.shape))
             alpha = cleaned(mask, rgb, self._cleanup, soft=self._backend.soft)
             write_picture(self._work / clip.paths[i].with_suffix(".png"), matte(rgb, alpha))
-            coverage.append(float((alpha > 127).mean()))
             inside = alpha > 127
-            edge = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
-            border.append(float(edge.mean()))
+            coverage.append(float(inside.mean()))
+            border.append(float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean()))
             overlaps.append(1.0 if before is None or before.shape != alpha.shape else overlap(before, alpha))
             before = alpha
         return _figures(clip, coverage, overlaps, border)
@@ -172,13 +163,12 @@ def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: l
             "--backend or its options, or --components 0 if the object is in many small parts."
         )
     names = [path.name for path in clip.paths]
+    steady_by = {"mean": sum(overlaps) / len(overlaps), "least": min(overlaps)}
     return {
         "pictures": len(clip),
         "film": clip.moving,
         "coverage": {"mean": sum(coverage) / len(coverage), "least": min(coverage), "most": max(coverage)},
-        "overlap_with_frame_before": {"mean": sum(overlaps) / len(overlaps), "least": min(overlaps)}
-        if clip.moving
-        else None,
+        "overlap_with_frame_before": steady_by if clip.moving else None,
         "at_border": sum(border) / len(border),
         "empty": [name for name, part in zip(names, coverage, strict=True) if part == 0],
         "look_at": [name for name, part in zip(names, overlaps, strict=True) if clip.moving and part < STEADY],
@@ -227,12 +217,15 @@ def main(argv: list[str] | None = None) -> int:
     add("--every", type=int, default=1, metavar="N", help="only each N-th picture, to try out (%(default)s)")
     add("--kind", choices=("auto", "film", "stills"), default="auto",
         help="film: a camera that stands still; auto: films, and folders in sequences/ (%(default)s)")  # fmt: skip
-    add_segment_options(parser)
+    add_options(parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)"), Cleanup, unset=True)
+    for title, kind in GROUPS.items():
+        add_options(parser.add_argument_group(title), kind)
 
     def run(arguments: argparse.Namespace, tick: Tick) -> str:
         backend = make_backend(arguments.backend, *(chosen(kind, arguments) for kind in GROUPS.values()))
+        cleanup = replace(UNTOUCHED if arguments.backend == "alpha" else Cleanup(), **given(Cleanup, arguments))
         manifest = segment(
-            arguments.pictures, arguments.out, backend, make_cleanup(arguments),
+            arguments.pictures, arguments.out, backend, cleanup,
             kind=arguments.kind, every=arguments.every, force=arguments.force, tick=tick,
         )  # fmt: skip
         return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
-from data_prep.common.pool import each
-from data_prep.common.progress import Tick, silent
+from data_prep.common.progress import Tick, each, silent
 from data_prep.common.stage import Stage, run_stage
 from data_prep.synthetic.plan import QUICK, Plan
 from gausim.core.errors import ConfigError

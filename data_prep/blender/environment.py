@@ -13,8 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -25,7 +24,7 @@ from gausim.io.files import write_durably
 
 BPY = "4.5.15"
 REQUIREMENTS = (f"bpy=={BPY}", "numpy<2")
-PYTHON = (3, 11)
+PYTHON = "3.11"
 # Marker file of an environment, written when it is complete.
 MARKER = "gausim-blender.json"
 INTERPRETER = Path("bin") / "python"
@@ -78,16 +77,18 @@ class BlenderProcess:
         Raises:
             BlenderError: with what Blender said last.
         """
-        with self._core() as core, tempfile.TemporaryFile("w+", errors="replace") as said:
+        core = self.cores.get()
+        try:
+            self._run_on(core, job, told, stop)
+        finally:
+            self.cores.put(core)
+
+    def _run_on(self, core: int, job: Mapping[str, Any], told: Callable[[str], None], stop: threading.Event) -> None:
+        # -I: no variable of this environment and no module of this folder may change what Blender loads.
+        command, pipe = [str(self.python), "-I", str(SCRIPT), str(core)], subprocess.PIPE
+        with tempfile.TemporaryFile("w+", errors="replace") as said:
             try:
-                # -I: no variable of this environment and no module of this folder may change what Blender loads.
-                process = subprocess.Popen(
-                    [self.python, "-I", SCRIPT, str(core)],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=said,
-                    text=True,
-                )
+                process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said, text=True)
             except OSError as error:
                 raise BlenderError(f"{self.python}: cannot be started ({error}).") from error
             try:
@@ -99,14 +100,6 @@ class BlenderProcess:
                 raise BlenderError("stopped, because another job failed.")
             if code != 0:
                 raise BlenderError(f"Blender gave up (exit code {code}):\n{_tail(said)}")
-
-    @contextmanager
-    def _core(self) -> Iterator[int]:
-        core = self.cores.get()
-        try:
-            yield core
-        finally:
-            self.cores.put(core)
 
 
 def _cores() -> SimpleQueue[int]:
@@ -151,9 +144,7 @@ def default_environment() -> Path:
     return Path(cache) / "gausim" / f"blender-{BPY}"
 
 
-def find_blender(
-    python: Path | None, folder: Path, *, say: Callable[[str], None], run: Runner = subprocess.run
-) -> BlenderProcess:
+def find_blender(python: Path | None, folder: Path, *, run: Runner = subprocess.run) -> BlenderProcess:
     """Blender of a Python of one's own, or of the environment in ``folder``, which is created where it is missing.
 
     Raises:
@@ -161,25 +152,27 @@ def find_blender(
         DataError: ``folder`` holds something else.
     """
     if python is None:
-        return BlenderProcess(create_environment(folder, say=say, run=run))
+        return BlenderProcess(create_environment(folder, run=run))
     if not (python.is_file() and os.access(python, os.X_OK)):
         raise BlenderError(f"--blender-python {python}: expected a Python interpreter that has bpy; no such program.")
     return BlenderProcess(python.absolute())
 
 
-def create_environment(folder: Path, *, say: Callable[[str], None], run: Runner = subprocess.run) -> Path:
+def create_environment(folder: Path, *, run: Runner = subprocess.run) -> Path:
     """The interpreter of the environment in ``folder``, after creating it if it is not there yet.
 
     It is made beside ``folder`` and takes its name when it is complete; a second process waits for the first.
     """
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(folder.with_name(f".{folder.name}.lock")):
+    with folder.with_name(f".{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
         if not _is_ready(folder):
             base = _base_python(run)
             making = folder.with_name(f".{folder.name}.making")
             shutil.rmtree(making, ignore_errors=True)
-            say(f"Creating an environment for Blender in {folder} (once; {', '.join(REQUIREMENTS)}, about 1 GB) ...")
+            told = f"Creating an environment for Blender in {folder} (once; {', '.join(REQUIREMENTS)}, about 1 GB) ..."
+            print(told, file=sys.stderr, flush=True)
             try:
                 _install(making, base, run)
                 write_durably(making / MARKER, json.dumps({"requirements": list(REQUIREMENTS)}).encode())
@@ -218,21 +211,13 @@ def _install(folder: Path, base: Path, run: Runner) -> None:
 
 def _base_python(run: Runner) -> Path:
     """An interpreter of the version that bpy is made for."""
-    wanted = ".".join(map(str, PYTHON))
-    for candidate in (sys.executable, shutil.which(f"python{wanted}")):
+    for candidate in (sys.executable, shutil.which(f"python{PYTHON}")):
         if candidate:
             question = [candidate, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
             done = run(question, capture_output=True, text=True)
-            if done.returncode == 0 and done.stdout.strip() == wanted:
+            if done.returncode == 0 and done.stdout.strip() == PYTHON:
                 return Path(candidate)
     raise ConfigError(
-        f"bpy {BPY} needs Python {wanted}, and there is no python{wanted} on the path. Install it, or bring a Python "
+        f"bpy {BPY} needs Python {PYTHON}, and there is no python{PYTHON} on the path. Install it, or bring a Python "
         "that has bpy with --blender-python."
     )
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    with path.open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

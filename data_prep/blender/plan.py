@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.blender.surface import SIZE, UP_AXES, Surface, farthest_points
+from data_prep.blender.meshes import SIZE, UP_AXES, Surface, farthest_points
 from data_prep.common.command import Options, option
 from data_prep.common.spread import dome
 from gausim.core import ConfigError
@@ -130,7 +130,11 @@ def cage(surface: Surface) -> dict[str, Any]:
 def action(plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
     """Pushes of a sequence: a poke is local, a drag moves a wide region, a double is two pokes at once."""
     rng = np.random.default_rng([plan.seed, 2, number])
-    kind, sites = KINDS[number % len(KINDS)], _sites(surface)
+    kind = KINDS[number % len(KINDS)]
+    # On the upper part of the surface, far from each other.
+    points = surface.vertices[surface.gt_ids].astype(np.float64)
+    upper = points[points[:, 2] >= 0.4 * points[:, 2].max()]
+    sites = upper[farthest_points(upper, SITES)]
     first = number % len(sites)
     chosen = [first]
     if kind == "double" and len(sites) > 1:
@@ -145,49 +149,49 @@ def action(plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
     return {"kind": kind, "pushes": pushes, "falloff": FALLOFF[kind], "amplitude": round(float(amplitude), 4)}
 
 
-def _sites(surface: Surface) -> np.ndarray:
-    """Sites of pushes: points (S, 3) on the upper part of the surface, far from each other."""
-    points = surface.vertices[surface.gt_ids].astype(np.float64)
-    upper = points[points[:, 2] >= 0.4 * points[:, 2].max()]
-    return upper[farthest_points(upper, SITES)]
+def still_entries(plan: Plan, surface: Surface) -> list[dict[str, Any]]:
+    """The stills as ``transforms.json`` lists them: from cameras that are spread evenly over the upper dome."""
+    poses = _poses(surface, dome(plan.pictures.stills, STILL_ELEVATION))
+    return [{"file_path": f"images/{i:04d}.png", "transform_matrix": pose} for i, pose in enumerate(poses)]
 
 
-def video_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
-    """Camera to world (OpenGL axes) of each view: all around, those held out between the others and higher."""
+def frame_entries(plan: Plan, surface: Surface) -> list[dict[str, Any]]:
+    """The frames of a sequence: from cameras all around, those held out between the others and higher."""
     trained = plan.views - plan.heldout
     angles = [(20.0 + 360 * i / trained, TRAIN_ELEVATIONS[i % len(TRAIN_ELEVATIONS)]) for i in range(trained)]
     between = 20.0 + 180 / trained
     angles += [(between + 360 * i / plan.heldout, HELDOUT_ELEVATION) for i in range(plan.heldout)]
-    distance = _distance(surface)
-    return [_pose(surface, math.radians(a), math.radians(e), distance) for a, e in angles]
+    poses = _poses(surface, [(math.radians(azimuth), math.radians(elevation)) for azimuth, elevation in angles])
+    return [
+        {
+            "file_path": frame_name(view, frame), "camera": view, "frame": frame, "time": frame / FPS,
+            "heldout": i >= trained, "transform_matrix": pose,
+        }
+        for frame in range(plan.frames)
+        for i, (view, pose) in enumerate(zip(plan.view_names, poses, strict=True))
+    ]  # fmt: skip
 
 
-def still_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
-    """Camera to world of each still, spread evenly over the upper dome."""
-    distance = _distance(surface)
-    return [_pose(surface, *angles, distance) for angles in dome(plan.pictures.stills, STILL_ELEVATION)]
+def frame_name(view: str, frame: int) -> str:
+    """A frame's file within its sequence."""
+    return f"{view}/{frame:04d}.png"
 
 
-def _distance(surface: Surface) -> float:
-    """From which the object fills the shorter side of an image, with room for its motion [scene units]."""
-    radius = float(np.linalg.norm(surface.vertices - _center(surface), axis=1).max())
-    return ROOM * radius / math.sin(FIELD_OF_VIEW / 2)
-
-
-def _center(surface: Surface) -> np.ndarray:
-    return np.array([0.0, 0.0, float(surface.vertices[:, 2].max()) / 2])
-
-
-def _pose(surface: Surface, azimuth: float, elevation: float, distance: float) -> list[list[float]]:
-    back = np.array([
-        math.cos(elevation) * math.sin(azimuth), -math.cos(elevation) * math.cos(azimuth), math.sin(elevation),
-    ])  # fmt: skip
-    right = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(back, right), back
-    pose[:3, 3] = _center(surface) + distance * back
-    matrix: list[list[float]] = pose.tolist()
-    return matrix
+def _poses(surface: Surface, angles: list[tuple[float, float]]) -> list[list[list[float]]]:
+    """Camera to world (OpenGL axes), at azimuths and elevations [radian], where the object fills the shorter side."""
+    center = np.array([0.0, 0.0, float(surface.vertices[:, 2].max()) / 2])
+    radius = float(np.linalg.norm(surface.vertices - center, axis=1).max())
+    distance = ROOM * radius / math.sin(FIELD_OF_VIEW / 2)
+    poses = []
+    for azimuth, elevation in angles:
+        back = np.array([
+            math.cos(elevation) * math.sin(azimuth), -math.cos(elevation) * math.cos(azimuth), math.sin(elevation),
+        ])  # fmt: skip
+        right = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        pose = np.eye(4)
+        pose[:3] = np.column_stack((right, np.cross(back, right), back, center + distance * back))
+        poses.append(pose.tolist())
+    return poses
 
 
 def camera(size: tuple[int, int]) -> dict[str, Any]:
@@ -205,46 +209,36 @@ def intrinsics(size: tuple[int, int]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def still_job(plan: Plan, surface: Surface, root: Path, numbers: range) -> dict[str, Any]:
+def still_job(plan: Plan, surface: Surface, root: Path, entries: list[dict[str, Any]]) -> dict[str, Any]:
     """The job of some stills."""
-    poses = still_poses(plan, surface)
-    images = [{"file": str(root / "static" / still_name(i)), "frame": None, "pose": poses[i]} for i in numbers]
-    return {**_job(plan, surface, root, plan.pictures.still_resolution), "motion": None, "images": images}
+    return {**_job(plan, surface, root, root / "static", entries, plan.pictures.still_resolution), "motion": None}
 
 
-def sequence_job(plan: Plan, surface: Surface, root: Path, number: int) -> dict[str, Any]:
+def sequence_job(
+    plan: Plan, surface: Surface, root: Path, number: int, entries: list[dict[str, Any]]
+) -> dict[str, Any]:
     """The job of one sequence: its motion and all its pictures."""
-    folder = root / "sequences" / sequence_name(number)
-    poses = video_poses(plan, surface)
-    images = [
-        {"file": str(folder / frame_name(view, frame)), "frame": frame, "pose": pose}
-        for frame in range(plan.frames)
-        for view, pose in zip(plan.view_names, poses, strict=True)
-    ]
+    folder = sequence_folder(root, number)
     motion = {
         **action(plan, surface, number), "file": str(folder / "ground_truth.npz"), "frames": plan.frames,
         "trial_frames": TRIAL_FRAMES, "substeps": SUBSTEPS, "push_ticks": PUSH_TICKS, "soft": asdict(plan.soft),
     }  # fmt: skip
-    return {**_job(plan, surface, root, plan.pictures.resolution), "motion": motion, "images": images}
+    return {**_job(plan, surface, root, folder, entries, plan.pictures.resolution), "motion": motion}
 
 
-def _job(plan: Plan, surface: Surface, root: Path, size: tuple[int, int]) -> dict[str, Any]:
+def _job(
+    plan: Plan, surface: Surface, root: Path, folder: Path, entries: list[dict[str, Any]], size: tuple[int, int]
+) -> dict[str, Any]:
+    images = [
+        {"file": str(folder / entry["file_path"]), "frame": entry.get("frame"), "pose": entry["transform_matrix"]}
+        for entry in entries
+    ]
     return {
         "task": "make", "rest": str(root / "rest_mesh.npz"), "cage": cage(surface), "camera": camera(size),
-        "samples": plan.pictures.samples,
+        "samples": plan.pictures.samples, "images": images,
     }  # fmt: skip
 
 
-def sequence_name(number: int) -> str:
-    """Folder of a sequence."""
-    return f"seq_{number:03d}"
-
-
-def frame_name(view: str, frame: int) -> str:
-    """A frame's file within its sequence."""
-    return f"{view}/{frame:04d}.png"
-
-
-def still_name(number: int) -> str:
-    """A still's file within ``static``."""
-    return f"images/{number:04d}.png"
+def sequence_folder(root: Path, number: int) -> Path:
+    """Where a sequence is."""
+    return root / "sequences" / f"seq_{number:03d}"

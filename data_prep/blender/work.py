@@ -15,22 +15,20 @@ import cv2
 import numpy as np
 
 from data_prep.blender.environment import BlenderError, BlenderProcess
-from data_prep.blender.meshes import read_mesh
+from data_prep.blender.meshes import Surface, make_surface, read_mesh
 from data_prep.blender.plan import (
     FPS,
     Plan,
     action,
     dataset_facts,
+    frame_entries,
     frame_name,
     intrinsics,
+    sequence_folder,
     sequence_job,
-    sequence_name,
+    still_entries,
     still_job,
-    still_name,
-    still_poses,
-    video_poses,
 )
-from data_prep.blender.surface import Surface, make_surface
 from data_prep.common.photos import write_image
 from data_prep.common.progress import Tick
 from data_prep.common.stage import PLAN, files_in, write_npz
@@ -62,18 +60,22 @@ def make_images(
     versions = blender.versions()
     _start(root, {**dataset_facts(plan, surface), "blender": versions})
     write_npz(root / "rest_mesh.npz", **vars(surface))
-    stills = [
-        range(i, min(i + STILLS_PER_JOB, plan.pictures.stills)) for i in range(0, plan.pictures.stills, STILLS_PER_JOB)
-    ]
-    jobs = [still_job(plan, surface, root, numbers) for numbers in stills]
-    jobs += [sequence_job(plan, surface, root, number) for number in range(plan.sequences)]
+    stills, frames = still_entries(plan, surface), frame_entries(plan, surface)
+    parts = [stills[i : i + STILLS_PER_JOB] for i in range(0, len(stills), STILLS_PER_JOB)]
+    jobs = [still_job(plan, surface, root, part) for part in parts]
+    jobs += [sequence_job(plan, surface, root, number, frames) for number in range(plan.sequences)]
     _run(jobs, blender, workers, tick)
-    _describe_stills(root / "static", plan, surface)
-    sequences = [_describe_sequence(root, plan, surface, number) for number in range(plan.sequences)]
+    lens = intrinsics(plan.pictures.still_resolution)
+    write_json(root / "static" / "transforms.json", {**lens, "frames": stills})
+    video = {**intrinsics(plan.pictures.resolution), "fps": FPS, "frames": frames}
+    sequences = []
+    for number in range(plan.sequences):
+        write_json(sequence_folder(root, number) / "transforms.json", video)
+        sequences.append(_describe_sequence(root, plan, surface, number))
     _write_overview(root, plan)
     for half in (path for path in root.rglob(".*") if path.is_file()):
         half.unlink()  # of a Blender that was killed
-    images = plan.pictures.stills + plan.sequences * plan.frames * plan.views
+    images = len(stills) + plan.sequences * len(frames)
     return {"blender": versions, "sequences": sequences, "images": images, "files": files_in(root)}
 
 
@@ -135,16 +137,9 @@ def _do(job: dict[str, Any], blender: BlenderProcess, told: Callable[[str], None
         raise BlenderError(f"{missing[0]}: Blender ended without writing it ({len(missing)} files are missing).")
 
 
-def _describe_stills(folder: Path, plan: Plan, surface: Surface) -> None:
-    frames = [
-        {"file_path": still_name(i), "transform_matrix": pose} for i, pose in enumerate(still_poses(plan, surface))
-    ]
-    write_json(folder / "transforms.json", {**intrinsics(plan.pictures.still_resolution), "frames": frames})
-
-
 def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
-    """Writes ``meta.json`` and ``transforms.json``; returns what the manifest tells of the sequence."""
-    folder = root / "sequences" / sequence_name(number)
+    """Writes ``meta.json``; returns what the manifest tells of the sequence."""
+    folder = sequence_folder(root, number)
     chosen, (strength, largest) = action(plan, surface, number), _motion(folder / "ground_truth.npz", plan)
     percent = 100 * float(largest.max()) / surface.diagonal
     meta = {
@@ -152,15 +147,6 @@ def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) ->
         "largest_displacement_per_frame": [round(float(value), 4) for value in largest],
     }  # fmt: skip
     write_json(folder / "meta.json", meta)
-    frames = [
-        {
-            "file_path": frame_name(view, frame), "camera": view, "frame": frame, "time": frame / FPS,
-            "heldout": i >= plan.views - plan.heldout, "transform_matrix": pose,
-        }
-        for frame in range(plan.frames)
-        for i, (view, pose) in enumerate(zip(plan.view_names, video_poses(plan, surface), strict=True))
-    ]  # fmt: skip
-    write_json(folder / "transforms.json", {**intrinsics(plan.pictures.resolution), "fps": FPS, "frames": frames})
     wanted = round(100 * chosen["amplitude"] / surface.diagonal, 3)
     return {
         "name": folder.name, "kind": chosen["kind"], "amplitude_wanted_percent": wanted,
@@ -186,7 +172,7 @@ def _write_overview(root: Path, plan: Plan) -> None:
     size = tuple(max(1, round(side * scale)) for side in plan.pictures.resolution)
     rows = []
     for number in range(min(plan.sequences, 6)):
-        folder, view = root / "sequences" / sequence_name(number), plan.view_names[number % plan.views]
+        folder, view = sequence_folder(root, number), plan.view_names[number % plan.views]
         pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.pictures.resolution) for frame in frames]
         shown = [picture[..., 2::-1] * (picture[..., 3:] / 255) for picture in pictures]
         rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))

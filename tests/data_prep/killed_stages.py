@@ -24,10 +24,8 @@ import torch
 import gausim.data.verify
 import gausim.io.ply
 import gausim.render.cpu  # noqa: F401
+from gausim.cli.prepare import STAGES
 
-STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready",
-          "import_springgaus", "import_pacnerf", "import_phystwin", "import_3dgsim", "import_physdreamer", "synthesize",
-          "corpus")  # fmt: skip
 PLACES = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (shutil, "rmtree"))
 
 

@@ -22,10 +22,10 @@ import pytest
 from helpers.plain import contents
 
 from data_prep.blender import environment as blender_env
+from data_prep.blender import plan as planning
 from data_prep.blender.environment import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
-from data_prep.blender.meshes import Mesh
-from data_prep.blender.plan import Pictures, Plan, Soft, action, cage, camera, sequence_job, still_job, video_poses
-from data_prep.blender.surface import Surface, make_surface
+from data_prep.blender.meshes import Surface, make_surface, read_mesh
+from data_prep.blender.plan import Pictures, Plan, Soft, action, cage, camera
 from data_prep.blender_bunny import main, make_set
 from gausim.core import ConfigError, DataError
 from gausim.data.objects import ObjectData
@@ -47,10 +47,8 @@ def mesh(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def surface() -> Surface:
-    corners = [[float(v) for v in line.split()[1:]] for line in BOX.splitlines()[:8]]
-    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
-    return make_surface(Mesh(np.array(corners), np.array(faces)), Path("box"), up="z", points=40, seed=0)
+def surface(mesh: Path) -> Surface:
+    return make_surface(read_mesh(mesh), mesh, up="z", points=40, seed=0)
 
 
 class FakeBlender:
@@ -163,15 +161,17 @@ def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) 
 
 
 def test_cameras_see_the_whole_object(surface: Surface) -> None:
-    jobs = [still_job(PLAN, surface, Path("/set"), range(23)), sequence_job(PLAN, surface, Path("/set"), 0)]
-    for job in jobs:
+    frames, folder = planning.frame_entries(PLAN, surface), Path("/set")
+    stills = planning.still_job(PLAN, surface, folder, planning.still_entries(PLAN, surface))
+    for job in (stills, planning.sequence_job(PLAN, surface, folder, 0, frames)):
         width, height = job["camera"]["size"]
         for image in job["images"]:
             view = np.linalg.inv(np.array(image["pose"])) * np.array([[1], [-1], [-1], [1]])
             seen = surface.vertices @ view[:3, :3].T + view[:3, 3]
             pixels = job["camera"]["focal"] * seen[:, :2] / seen[:, 2:] + (width / 2, height / 2)
             assert (seen[:, 2] > 0).all() and (pixels > 0).all() and (pixels < (width, height)).all()
-    angles = [np.degrees(np.arctan2(pose[0][3], -pose[1][3])) % 360 for pose in video_poses(PLAN, surface)]
+    poses = [entry["transform_matrix"] for entry in frames[:3]]
+    angles = [np.degrees(np.arctan2(pose[0][3], -pose[1][3])) % 360 for pose in poses]
     np.testing.assert_allclose(angles, [20, 200, 110])
     for size in ((540, 960), (960, 540)):
         assert camera(size)["focal"] == pytest.approx(270 / np.tan(np.radians(20)))
@@ -205,26 +205,26 @@ class FakeRunner:
         return subprocess.CompletedProcess(command, 0, self.version + "\n", "")
 
 
-def test_environment_is_created_once(tmp_path: Path) -> None:
-    said: list[str] = []
+def test_environment_is_created_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runner = FakeRunner()
-    python = create_environment(tmp_path / "cache" / "blender", say=said.append, run=runner)
+    python = create_environment(tmp_path / "cache" / "blender", run=runner)
     assert python == tmp_path / "cache" / "blender" / "bin" / "python" and python.exists()
     assert runner.commands[-1][-2:] == list(REQUIREMENTS) and "venv" in runner.commands[-2]
-    assert len(said) == 1 and "bpy==" in said[0] and str(tmp_path / "cache" / "blender") in said[0]
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "bpy==" in said and str(tmp_path / "cache" / "blender") in said
     again = FakeRunner()
-    assert find_blender(None, tmp_path / "cache" / "blender", say=said.append, run=again).python == python
-    assert again.commands == [] and len(said) == 1
+    assert find_blender(None, tmp_path / "cache" / "blender", run=again).python == python
+    assert again.commands == [] and capsys.readouterr().err == ""
 
 
 def test_failed_installation_says_why_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / ".blender.making" / "bin").mkdir(parents=True)  # of an installation that was killed
     with pytest.raises(ConfigError, match=r"needs Python 3\.11(.|\n)*--blender-python"):
-        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(version="3.12"))
+        create_environment(tmp_path / "blender", run=FakeRunner(version="3.12"))
     with pytest.raises(BlenderError, match="no matching distribution(.|\n)*--blender-python"):
-        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(pip=1))
+        create_environment(tmp_path / "blender", run=FakeRunner(pip=1))
     assert [p.name for p in tmp_path.iterdir()] == [".blender.lock"]
-    create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner())
+    create_environment(tmp_path / "blender", run=FakeRunner())
     assert sorted(p.name for p in (tmp_path / "blender").iterdir()) == ["bin", blender_env.MARKER]
 
 
@@ -232,7 +232,7 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
     for content in ("{", '{"requirements": ["bpy==3.0"]}', "[]"):
         (tmp_path / blender_env.MARKER).write_text(content)
         with pytest.raises(DataError, match="--blender-env"):
-            create_environment(tmp_path, say=lambda _: None, run=FakeRunner())
+            create_environment(tmp_path, run=FakeRunner())
         assert (tmp_path / blender_env.MARKER).read_text() == content
 
 
@@ -266,7 +266,7 @@ def test_a_failed_process_says_why(tmp_path: Path) -> None:
     with pytest.raises(BlenderError, match="cannot be started"):
         BlenderProcess(tmp_path / "absent").run({}, lambda _: None, threading.Event())
     with pytest.raises(BlenderError, match="--blender-python"):
-        find_blender(tmp_path / "absent", tmp_path, say=lambda _: None)
+        find_blender(tmp_path / "absent", tmp_path)
     with pytest.raises(BlenderError, match="did not tell its versions"):
         BlenderProcess(program(tmp_path / "silent", "sys.stdin.read()")).versions()
 

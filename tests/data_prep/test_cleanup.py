@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_prep.capture.masks.cleanup import (
-    UNTOUCHED,
-    Cleanup,
-    cleaned,
-    fill_holes,
-    keep_largest,
-    soften,
-    steady,
-)
+from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup, cleaned, fill_holes, keep_largest, soften, steady
 
 
 def square(top: int, left: int, side: int, size: int = 60) -> np.ndarray:
@@ -59,6 +51,3 @@ def test_edges_follow_the_picture() -> None:
     alpha = cleaned(square(19, 19, 22), rgb, Cleanup(edge=0.05), soft=False)
     assert alpha.dtype == np.uint8 and ((alpha == 0) | (alpha >= 12)).all() and len(np.unique(alpha)) > 3
     assert set(np.unique(cleaned(square(19, 19, 22), rgb, UNTOUCHED, soft=False))) == {0, 255}
-
-
-# ---- what is broken, and starting again

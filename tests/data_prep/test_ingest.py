@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from data_prep.common.photos import natural
 from data_prep.ingest import IngestOptions, ingest, main
 from gausim.core import DataError
 
+Refused = Callable[..., str]
 NTSC = Fraction(30000, 1001)
 RATE = 48000
 SIZE = 96, 64
@@ -157,8 +158,7 @@ def test_offsets_are_found_to_a_quarter_frame(filmed: tuple[Fraction, Path], met
 def test_frames_come_out_synchronised(filmed: tuple[Fraction, Path], tmp_path: Path, method: str) -> None:
     """Each output frame shows the disc where it was, within the residual that is reported, as the decoder gave it."""
     rate, folder = filmed
-    manifest = ingest(folder, tmp_path / "out", IngestOptions(sync=method))
-    found = manifest["results"]["sequences"]["seq_000"]
+    found = ingested(folder, tmp_path / "out", sync=method)
     assert found["method"] == ("timecode" if method == "auto" else method)
     cameras, truth = found["cameras"], three_cameras(rate)
     reference = truth[found["reference"]]
@@ -195,12 +195,22 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, out: Path, *options: str) -> str:
-    """The error that the command ends with; nothing may be left that looks like a result."""
-    assert main([str(folder), "--out", str(out), *options]) == 2
-    message = capsys.readouterr().err
-    assert message.startswith("error: ") and not (out / "stage.json").exists()
-    return message
+@pytest.fixture
+def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Refused:
+    """Gives the error that the command ends with; nothing may be left that looks like a result."""
+
+    def run(folder: Path, options: str = "") -> str:
+        assert main([str(folder), "--out", str(tmp_path / "refused"), *options.split()]) == 2
+        message = capsys.readouterr().err
+        assert message.startswith("error: ") and not (tmp_path / "refused" / "stage.json").exists()
+        return message
+
+    return run
+
+
+def ingested(folder: Path, out: Path, **options: Any) -> dict[str, Any]:
+    """What the manifest says of the only sequence."""
+    return ingest(folder, out, IngestOptions(**options))["results"]["sequences"]["seq_000"]
 
 
 @pytest.mark.parametrize(
@@ -215,10 +225,10 @@ def refused(capsys: pytest.CaptureFixture[str], folder: Path, out: Path, *option
     ],
 )  # fmt: skip
 def test_films_that_nothing_brings_together_are_refused(
-    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: str, messages: tuple[str, ...]
+    pair: Path, refused: Refused, options: str, messages: tuple[str, ...]
 ) -> None:
     """The camera is named, and every method says why it does not apply."""
-    message = refused(capsys, pair, tmp_path / "out", *options.split())
+    message = refused(pair, options)
     assert all(part in message for part in messages), message
 
 
@@ -236,26 +246,22 @@ def test_silence_and_strangers_sounds_are_refused(tmp_path: Path) -> None:
 
 
 def test_time_code_that_the_sound_contradicts_is_refused(
-    filmed: tuple[Fraction, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    filmed: tuple[Fraction, Path], tmp_path: Path, refused: Refused
 ) -> None:
     """auto does not believe a camera whose time code was never set."""
     rate, folder = filmed
     (tmp_path / "in").mkdir()
-    truth = three_cameras(rate)["cam_1"]
     os.link(folder / "cam_0.mp4", tmp_path / "in" / "cam_0.mp4")
-    drop = rate.denominator != 1
-    Camera(truth.start, rate, truth.frames, label(rate, 1810, drop=drop), "aac", seed=1).write(
-        tmp_path / "in" / "cam_1.mp4"
-    )
-    message = refused(capsys, tmp_path / "in", tmp_path / "out")
+    unset = label(rate, 1810, drop=rate.denominator != 1)
+    replace(three_cameras(rate)["cam_1"], timecode=unset, audio="aac").write(tmp_path / "in" / "cam_1.mp4")
+    message = refused(tmp_path / "in")
     assert "cam_1 (cam_1.mp4): its time code and its sound disagree" in message and "--sync audio" in message
 
 
 @pytest.mark.parametrize("offset", ["2.5f", "0.1"])
 def test_offsets_choose_frames_and_trim(pair: Path, tmp_path: Path, offset: str) -> None:
     """Half a frame is the most that rounding leaves; what only one camera saw is cut off."""
-    manifest = ingest(pair, tmp_path / "out", IngestOptions(sync="offsets", offsets={"side_1": offset}))
-    cameras = manifest["results"]["sequences"]["seq_000"]["cameras"]
+    cameras = ingested(pair, tmp_path / "out", sync="offsets", offsets={"side_1": offset})["cameras"]
     assert cameras["cam_1"]["residual_frames"]["largest"] in (0.0, pytest.approx(0.5, abs=1e-3))
     assert cameras["cam_0"]["kept"][0] in (2, 3) and cameras["cam_0"]["kept"][1] == 19
     later = cameras["cam_1"]["offset_frames"] - cameras["cam_0"]["offset_frames"]
@@ -264,51 +270,44 @@ def test_offsets_choose_frames_and_trim(pair: Path, tmp_path: Path, offset: str)
 
 
 def test_start_duration_and_size(pair: Path, tmp_path: Path) -> None:
-    options = IngestOptions(
-        sync="offsets", offsets={"cam_1": "2f"}, reference="side_0", start=0.2, duration=0.3, max_side=48
-    )
-    found = ingest(pair, tmp_path / "out", options)["results"]["sequences"]["seq_000"]
+    part = {"start": 0.2, "duration": 0.3, "max_side": 48}
+    found = ingested(pair, tmp_path / "out", sync="offsets", offsets={"cam_1": "2f"}, reference="side_0", **part)
     assert found["frames"] == 8 and found["reference"] == "cam_0"
     assert found["cameras"]["cam_0"]["kept"] == [7, 14] and found["cameras"]["cam_1"]["kept"] == [5, 12]
     assert cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_1/0000.png")).shape == (32, 48, 3)
 
 
-def test_whole_multiples_of_a_rate_go_together_and_others_do_not(
-    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_whole_multiples_of_a_rate_go_together_and_others_do_not(tmp_path: Path, refused: Refused) -> None:
     """50 beside 25 gives every second frame; 29.97 beside 25 is refused by name."""
     folder = tmp_path / "in"
     Camera(0.1, Fraction(25), 20, audio=None, seed=1).write(folder / "a.mp4")
     Camera(0.1 + 3 / 50, Fraction(50), 40, audio=None, seed=1).write(folder / "b.mp4")
-    options = IngestOptions(sync="offsets", offsets={"b": "3f"})
-    found = ingest(folder, tmp_path / "out", options)["results"]["sequences"]["seq_000"]
+    found = ingested(folder, tmp_path / "out", sync="offsets", offsets={"b": "3f"})
     assert found["fps"] == 25 and found["cameras"]["cam_0"]["fps"] == 25 and found["cameras"]["cam_1"]["fps"] == 50
     kept, residual = (found["cameras"]["cam_1"][name] for name in ("kept", "residual_frames"))
     assert kept[1] - kept[0] == 2 * (found["frames"] - 1) and residual["largest"] <= 0.5 + 1e-6
     Camera(0.1, NTSC, 20, audio=None).write(folder / "b.mp4")
-    message = refused(capsys, folder, tmp_path / "other", "--sync", "offsets", "--offsets", "b=0")
+    message = refused(folder, "--sync offsets --offsets b=0")
     assert "cam_1 (b.mp4): 29.97" in message and "no whole multiple" in message
 
 
-def test_missing_frames_leave_a_residual_and_are_refused(
-    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_frames_leave_a_residual_and_are_refused(tmp_path: Path, refused: Refused) -> None:
     """A camera that dropped frames has none near their places: which camera and which frame is said."""
     folder = tmp_path / "in"
     Camera(0.0, Fraction(25), 20, audio=None).write(folder / "a.mp4")
     Camera(0.0, Fraction(25), 17, audio=None).write(folder / "b.mp4", stamps=[*range(9), *range(12, 20)])
     assert probe(folder / "b.mp4").variable
-    message = refused(capsys, folder, tmp_path / "out", "--sync", "offsets", "--offsets", "b=0")
+    message = refused(folder, "--sync offsets --offsets b=0")
     assert "cam_1 (b.mp4): output frame" in message and "allowed 0.5" in message and "rate varies" in message
-    found = ingest(folder, tmp_path / "cut", IngestOptions(sync="offsets", offsets={"b": "0"}, duration=0.3))
-    assert found["results"]["sequences"]["seq_000"]["frames"] == 8  # before the gap all is well
+    found = ingested(folder, tmp_path / "cut", sync="offsets", offsets={"b": "0"}, duration=0.3)
+    assert found["frames"] == 8  # before the gap all is well
 
 
 def test_turned_cameras_come_out_upright(tmp_path: Path) -> None:
     """The display matrix of a phone held upright is applied, not only read."""
     camera = Camera(0.1, Fraction(25), 6, audio=None, turned=90, crf="10")
     camera.write(tmp_path / "in" / "a.mp4")
-    found = ingest(tmp_path / "in", tmp_path / "out")["results"]["sequences"]["seq_000"]
+    found = ingested(tmp_path / "in", tmp_path / "out")
     assert found["method"] == "single" and found["cameras"]["cam_0"]["rotation"] == 90
     assert found["cameras"]["cam_0"]["size"] == list(SIZE[::-1])
     written = cv2.cvtColor(cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_0/0003.png")), cv2.COLOR_BGR2RGB)
@@ -325,10 +324,10 @@ FAULTS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize(("fault", "suffix"), [*((fault, ".mp4") for fault in FAULTS), ("no end", ".mkv")])
-def test_broken_films_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, fault: str) -> None:
+def test_broken_films_are_named(tmp_path: Path, refused: Refused, suffix: str, fault: str) -> None:
     film = Camera(0.1, Fraction(25), 20, crf="1").write(tmp_path / "in" / f"bad{suffix}")
     film.write_bytes(FAULTS[fault](film.read_bytes()))
-    message = refused(capsys, tmp_path / "in", tmp_path / "out")
+    message = refused(tmp_path / "in")
     assert f"bad{suffix}: " in message and ("empty (0 bytes)" in message) == (fault == "empty")
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_prep.blender.meshes import Mesh, read_mesh
-from data_prep.blender.surface import farthest_points, make_surface, refine
+from data_prep.blender.meshes import Mesh, farthest_points, make_surface, read_mesh, refine
 from gausim.core import DataError
 
 CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
@@ -43,6 +42,11 @@ def ply(
     body += b"".join(struct.pack(f"{order}BB{len(face)}i", 7, len(face), *face) for face in faces)
     path.write_bytes(header.encode() + body)
     return path
+
+
+def volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
+    a, b, c = vertices[triangles.T]
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def test_obj_and_all_encodings_of_ply_give_the_same_box(tmp_path: Path) -> None:
@@ -121,19 +125,16 @@ def test_surface_stands_upright_in_its_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.vertices[:, :2].min(0), -found.vertices[:, :2].max(0), rtol=1e-6)
         assert found.vertices[:, 2].min() == 0 and len(found.gt_ids) == 50
         # Outward faces stay outward: the object is turned, not mirrored.
-        a, b, c = (found.vertices[found.faces[:, i]].astype(np.float64) for i in range(3))
-        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
         original = read_mesh(path)
-        a, b, c = (original.vertices[original.triangles[:, i]] for i in range(3))
-        assert np.sign(volume) == np.sign(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())
+        turned = volume(found.vertices.astype(np.float64), found.faces)
+        assert np.sign(turned) == np.sign(volume(original.vertices, original.triangles))
 
 
 def test_refined_surface_is_closed_and_of_the_same_volume_and_area() -> None:
     mesh = Mesh(POINTS, np.array(TETRAHEDRON))
     fine = refine(mesh, 0.13)
     for found in (mesh, fine):
-        a, b, c = (found.vertices[found.triangles[:, i]] for i in range(3))
-        np.testing.assert_allclose(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6, 1 / 6, rtol=1e-12)
+        np.testing.assert_allclose(volume(found.vertices, found.triangles), 1 / 6, rtol=1e-12)
         edges = np.concatenate([found.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
         assert len(np.unique(edges, axis=0)) == len(edges)  # each directed edge once, so neighbours stay joined
         assert {tuple(e) for e in edges.tolist()} == {tuple(e[::-1]) for e in edges.tolist()}
@@ -151,7 +152,7 @@ def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
             make_surface(Mesh(vertices, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
     with pytest.raises(DataError, match="too large"):
         make_surface(Mesh((POINTS - 0.5) * 3e308, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
-    monkeypatch.setattr("data_prep.blender.surface.MOST_TRIANGLES", 5000)
+    monkeypatch.setattr("data_prep.blender.meshes.MOST_TRIANGLES", 5000)
     with pytest.raises(DataError, match="Remesh"):
         refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
 

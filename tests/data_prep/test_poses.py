@@ -13,7 +13,7 @@ from helpers import colmap_files, public_sets
 from data_prep import poses as command
 from data_prep.capture.cameras.lenses import rays_of, straighten
 from data_prep.capture.cameras.mapping import MappingOptions
-from data_prep.capture.cameras.material import Sources
+from data_prep.capture.cameras.sources import Sources
 from data_prep.capture.cameras.world import compare
 from data_prep.common.stage import read_manifest
 from data_prep.compare_poses import main as compare_main

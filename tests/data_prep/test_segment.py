@@ -14,12 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from data_prep.capture.masks.cleanup import (
-    Cleanup,
-    overlap,
-)
+from data_prep.capture.masks.cleanup import Cleanup, overlap
 from data_prep.capture.masks.clips import find_clips, read_picture
-from data_prep.capture.masks.onnx_segmenter import OnnxSegmenter
+from data_prep.capture.masks.onnx_segmenter import NetworkOptions, OnnxSegmenter
 from data_prep.capture.masks.sam2_segmenter import Prompt, Sam2Segmenter, load_predictor, make_prompt
 from data_prep.capture.masks.segmenters import Backend
 from data_prep.common.stage import read_manifest
@@ -160,23 +157,20 @@ def tensor_type(name: str, shape: tuple[int | str, ...]) -> bytes:
     return proto(1, name.encode()) + proto(2, proto(1, proto(1, 1) + proto(2, dims)))
 
 
-def network(
-    path: Path, operation: str, *, side: int | str = 32, channels: int = 3, axes: tuple[int, ...] = (1,)
-) -> Path:
+def network(path: Path, operation: str, *, side: int | str = 32, channels: int = 3) -> Path:
     """A network of one ReduceMax (over channels) or other operation, written by hand: no ONNX library is needed."""
-    attributes = proto(5, proto(1, b"axes") + b"".join(proto(8, n) for n in axes) + proto(20, 7))
-    node = (
-        proto(1, b"x") + proto(2, b"y") + proto(4, operation.encode()) + (attributes if "Reduce" in operation else b"")
-    )
-    shape = (1, channels, side, side)
-    graph = (
-        proto(1, node)
-        + proto(2, b"g")
-        + proto(11, tensor_type("x", shape))
-        + proto(12, proto(1, b"y") + proto(2, proto(1, proto(1, 1))))
-    )
+    node = proto(1, b"x") + proto(2, b"y") + proto(4, operation.encode())
+    if "Reduce" in operation:
+        node += proto(5, proto(1, b"axes") + proto(8, 1) + proto(20, 7))
+    given = proto(11, tensor_type("x", (1, channels, side, side)))
+    made = proto(12, proto(1, b"y") + proto(2, proto(1, proto(1, 1))))
+    graph = proto(1, node) + proto(2, b"g") + given + made
     path.write_bytes(proto(1, 8) + proto(7, graph) + proto(8, proto(1, b"") + proto(2, 12)))
     return path
+
+
+def network_of(path: Path, **options: Any) -> OnnxSegmenter:
+    return OnnxSegmenter(NetworkOptions(onnx=path, **{f"onnx_{name}": value for name, value in options.items()}))
 
 
 def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
@@ -189,9 +183,9 @@ def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
     assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), *options]) == 0
     mask = read_picture(tmp_path / "out" / "a.png")[..., 3]
     assert mask.shape == SIZE[::-1] and overlap(mask, disc(3).astype(np.uint8) * 255) > 0.95
-    sigmoid = OnnxSegmenter(file, size=32, mean=(127.0,) * 3, scale=(10.0,) * 3, activation="sigmoid").mask(rgb)
+    sigmoid = network_of(file, size=32, mean=(127.0,) * 3, scale=(10.0,) * 3, activation="sigmoid").mask(rgb)
     assert sigmoid[disc(3)].max() == pytest.approx(1, abs=1e-4) and sigmoid[0, -1] == pytest.approx(0, abs=1e-4)
-    stretched = OnnxSegmenter(file, size=48, mean=(7.0,), scale=(3.0,), activation="minmax").mask(rgb)
+    stretched = network_of(file, size=48, mean=(7.0,), scale=(3.0,), activation="minmax").mask(rgb)
     assert stretched.min() == 0 and stretched.max() == 1
 
 
@@ -210,16 +204,16 @@ def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
 def test_networks_that_do_not_fit_are_named(tmp_path: Path, made: dict, options: dict, what: str) -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises((ConfigError, DataError), match=what):
-        OnnxSegmenter(network(tmp_path / "a.onnx", **{"operation": "ReduceMax", **made}), **options).mask(picture(1))
+        network_of(network(tmp_path / "a.onnx", **{"operation": "ReduceMax", **made}), **options).mask(picture(1))
 
 
 def test_files_that_are_no_networks_are_named(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     (tmp_path / "noise.onnx").write_bytes(struct.pack("40d", *range(40)))
     with pytest.raises(DataError, match=r"noise.onnx: cannot be loaded"):
-        OnnxSegmenter(tmp_path / "noise.onnx")
+        network_of(tmp_path / "noise.onnx")
     with pytest.raises(DataError, match="no such network"):
-        OnnxSegmenter(tmp_path / "none.onnx")
+        network_of(tmp_path / "none.onnx")
 
 
 # ---- SAM 2
@@ -250,7 +244,7 @@ class FakePredictor:
 
 
 def sam2(predictor: FakePredictor, prompts: dict[str, Prompt]) -> Backend:
-    return Backend("sam2", lambda: Sam2Segmenter(predictor, prompts), soft=True, settings={"prompts": sorted(prompts)})
+    return Backend("sam2", Sam2Segmenter(predictor, prompts).open, soft=True, settings={"prompts": sorted(prompts)})
 
 
 @pytest.mark.parametrize("prompt", [Prompt(box=(4, 24, 28, 48)), Prompt(points=((16, 36, 1), (90, 5, 0)))])
@@ -315,9 +309,8 @@ def test_masks_that_are_no_masks_are_refused(film: Path, tmp_path: Path) -> None
         ((3, 3), 0.5, "shape"), (SIZE[::-1], np.nan, "no numbers"), (SIZE[::-1], 0, "nothing was found in any of 9"),
     ):  # fmt: skip
         mask = np.full(shape, value, np.float32)
-        broken = SimpleNamespace(open=lambda clip, mask=mask: lambda index: mask)
         with pytest.raises(DataError, match=message):
-            segment(film, tmp_path / "out", Backend("mine", lambda broken=broken: broken), Cleanup())
+            segment(film, tmp_path / "out", Backend("mine", lambda clip, mask=mask: lambda index: mask), Cleanup())
     assert not (tmp_path / "out").exists()
 
 

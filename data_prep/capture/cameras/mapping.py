@@ -6,11 +6,11 @@ a small part of the time. With one thread and one seed the same photos give the 
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -69,20 +69,14 @@ class MappingOptions(Options):
             raise ConfigError(f"--camera-model '{self.camera_model}': expected one of {', '.join(PARAMETERS)}.")
 
 
-@dataclass(frozen=True)
-class Mapped:
-    """Facts of a mapping beside the model itself."""
-
-    folder: Path  # of the COLMAP model with most images, in the photos' names
-    features: dict[str, int]  # number of features per photo
-    matches: dict[str, int]  # per photo, inliers of all its verified pairs
-    others: tuple[int, ...]  # numbers of images of the models that could not be joined with it
-
-
 def map_photos(
     photos: Sequence[Photo], cameras: Mapping[str, str], work: Path, options: MappingOptions, tick: Tick
-) -> Mapped:
+) -> tuple[Path, dict[str, int], dict[str, int], list[int]]:
     """Finds the poses of photos.
+
+    Returns:
+        Folder of the COLMAP model with most images, in the photos' names; per photo the number of its features, and
+        the inliers of all its verified pairs; numbers of images of the models that could not be joined with that one.
 
     Raises:
         DataError: no two photos fit together.
@@ -90,7 +84,7 @@ def map_photos(
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     if len(photos) < _SMALLEST_MODEL:
         raise DataError(f"{len(photos)} photos: expected at least {_SMALLEST_MODEL}; the paper takes 200.")
-    count = {p.name: _extract(p, work, options, tick, i, len(photos)) for i, p in enumerate(photos)}
+    features = {p.name: _extract(p, work, options, tick, i, len(photos)) for i, p in enumerate(photos)}
     database = work / SCRATCH / "database.db"
     if not database.is_file():
         _fill(database, photos, cameras, work, options)
@@ -98,7 +92,7 @@ def map_photos(
     matches = _inliers(database, photos)
     folder = work / "colmap" / "sparse" / "0"
     sizes = _mapped(database, photos, folder, options, tick)
-    return Mapped(folder, count, matches, tuple(sizes[1:]))
+    return folder, features, matches, sizes[1:]
 
 
 def _features_file(work: Path, number: int) -> Path:
@@ -157,7 +151,7 @@ def _number_name(number: int) -> str:
 
 
 def _pairs(count: int, options: MappingOptions) -> Iterator[tuple[int, int]]:
-    for i, j in combinations(range(count), 2):
+    for i, j in itertools.combinations(range(count), 2):
         # The last and the first are neighbours too: people walk around the object.
         if options.matching == "exhaustive" or min(j - i, count - (j - i)) <= options.overlap:
             yield i, j
@@ -202,17 +196,16 @@ def _mapped(database: Path, photos: Sequence[Photo], folder: Path, options: Mapp
     settings.mapper.num_threads, settings.mapper.random_seed = options.threads, SEED
     settings.triangulation.random_seed = SEED
     settings.extract_colors, settings.min_model_size = False, _SMALLEST_MODEL
-    done = [0]
+    numbers = itertools.count(1)
 
-    def count() -> None:
-        done[0] = min(done[0] + 1, len(photos))
-        tick("mapping", done[0], len(photos))
+    def told() -> None:
+        tick("mapping", min(next(numbers), len(photos)), len(photos))
 
     models = database.parent / "models"
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
     pycolmap.set_random_seed(SEED)
-    found = pycolmap.incremental_mapping(database, database.parent, models, settings, next_image_callback=count)
+    found = pycolmap.incremental_mapping(database, database.parent, models, settings, next_image_callback=told)
     ranked = sorted(found.values(), key=lambda model: -model.num_reg_images())
     if not ranked:
         raise DataError(

@@ -20,11 +20,12 @@ _FEW_FEATURES, _FEW_MATCHES = 300, 60
 
 def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
     """Indices of a photo's (m,) keypoints that show a point of the table, and the rows of these points."""
-    order = np.argsort(points.ids, kind="stable")
-    place = np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=max(len(order) - 1, 0))
-    rows = order[place] if len(order) else np.zeros(0, int)
-    known = points.ids[rows] == shot.point_ids if len(order) else np.zeros(len(shot.point_ids), bool)
-    return known, rows[known] if len(order) else rows
+    if not len(points.ids):
+        return np.zeros(len(shot.point_ids), bool), np.zeros(0, int)
+    order = np.argsort(points.ids)
+    rows = order[np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=len(order) - 1)]
+    known = points.ids[rows] == shot.point_ids
+    return known, rows[known]
 
 
 def reprojection(posed: Sequence[Posed], points: PointTable) -> dict[str, Any]:
@@ -83,21 +84,17 @@ def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:
 
 
 def draw_cameras(path: Path, posed: Sequence[Posed], points: np.ndarray, colors: np.ndarray, title: str) -> None:
-    """Writes a picture of points (P, 3) with colours (P, 3) uint8 and of the cameras, from above and from two sides."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Writes a PNG of points (P, 3) with colours (P, 3) uint8 and of the cameras, from above and from two sides."""
     from matplotlib.figure import Figure
 
     viewmats = np.stack([shot.viewmat for shot in posed])
     eyes = centers(viewmats)
     around = np.concatenate((eyes, points)) if len(points) else eyes
     # Stray points far away would shrink everything else to a dot.
-    low, high = (
-        np.minimum(np.percentile(around, 2, 0), eyes.min(0)),
-        np.maximum(np.percentile(around, 98, 0), eyes.max(0)),
-    )
+    low = np.minimum(np.percentile(around, 2, 0), eyes.min(0))
+    high = np.maximum(np.percentile(around, 98, 0), eyes.max(0))
     reach = 0.06 * float(np.linalg.norm(high - low)) + 1e-9
     figure = Figure(figsize=(16.5, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title)
     for panel, (across, up) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
         panel.scatter(points[:, across], points[:, up], s=2, c=colors / 255.0, linewidths=0)

@@ -1,4 +1,7 @@
-"""Poses that somebody else found: COLMAP models, ``transforms.json`` with any lens, projection matrices."""
+"""Inputs of the stage of poses: photos, frames of sequences, and poses that somebody else found.
+
+These are COLMAP models, ``transforms.json`` with any lens, or projection matrices.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from data_prep.common.photos import Photo, list_images, open_photo
+from data_prep.common.command import Options, option
+from data_prep.common.photos import Photo, list_images, natural, open_photo
+from data_prep.common.stage import MANIFEST, read_manifest
 from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap import ColmapCamera, ColmapModel
+from gausim.io.colmap import ColmapCamera, ColmapModel, PointTable, colmap_files, find_colmap, no_points, read_colmap
 from gausim.io.plain_json import read_json
 
 # Endings with which projection matrices are named after their image.
@@ -25,6 +30,42 @@ _SKEW_PIXELS = 1.0
 _DECOMPOSED = 1e-6
 
 
+@dataclass(frozen=True)
+class Sources(Options):
+    """Options for the inputs of the poses."""
+
+    images: Path | None = option(None, "photos of the rest state", metavar="DIR")
+    sequences: Path | None = option(
+        None, "result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and its first "
+        "frame shows the rest state", metavar="DIR",
+    )  # fmt: skip
+    fps: float | None = option(None, "frames per second of the sequences (default: that of ingest)", metavar="RATE")
+    colmap: Path | None = option(
+        None, "COLMAP model to take over, binary or text, for --images of any size", metavar="DIR"
+    )
+    transforms: Path | None = option(
+        None, "transforms.json to take over, also with OPENCV or OPENCV_FISHEYE distortion", metavar="FILE"
+    )
+    projections: Path | None = option(
+        None, "3 x 4 matrices to take over, as text: NAME.txt or NAME_P.txt for NAME.jpg", metavar="DIR"
+    )
+    scale: float = option(1.0, "size of the photos / size the matrices are for (%(default)s)")
+
+    def __post_init__(self) -> None:
+        """Checks that they go together."""
+        super().__post_init__()
+        taken = [n for n in ("colmap", "transforms", "projections") if getattr(self, n) is not None]
+        if len(taken) > 1:
+            raise ConfigError(f"--{' and --'.join(taken)}: poses come from one of them; give one.")
+        if self.images is None and self.transforms is None and (self.sequences is None or taken):
+            raise ConfigError("--images: give the folder of the photos.")
+
+    @property
+    def kind(self) -> str:
+        """``mapping`` or what is taken over."""
+        return next((n for n in ("colmap", "transforms", "projections") if getattr(self, n) is not None), "mapping")
+
+
 @dataclass(frozen=True, eq=False)
 class Posed:
     """One photo with its pose and lens."""
@@ -34,6 +75,77 @@ class Posed:
     viewmat: np.ndarray  # (4, 4) float64 world to camera, OpenCV axes
     xy: np.ndarray  # (m, 2) float64 pixels of the photo that show points
     point_ids: np.ndarray  # (m,) int64 which points
+
+
+@dataclass(frozen=True)
+class Material:
+    """Photos, frames and poses found in the sources."""
+
+    stills: tuple[Photo, ...]  # photos whose poses are to be found
+    # poses that are taken over, with their points; None where they are to be found
+    posed: tuple[list[Posed], PointTable] | None
+    sequences: dict[Path, tuple[str, ...]]  # the folders of sequences with the names of their cameras
+    fps: float | None  # frames per second of the sequences
+    inputs: dict[str, Path]  # all files that are read, by the names that the manifest gives them
+
+    @staticmethod
+    def of(sources: Sources) -> Material:
+        """Looks what is there.
+
+        Raises:
+            DataError: something that was named is missing or malformed.
+        """
+        stills: tuple[Photo, ...] = ()
+        posed, inputs = _taken_over(sources)
+        if sources.images is not None and posed is None:
+            stills = tuple(open_photo(path, path.name) for path in list_images(sources.images))
+            inputs = {f"images/{photo.name}": photo.path for photo in stills}
+        folders, fps = _sequences(sources)
+        for folder, cameras in folders.items():
+            for camera in cameras:
+                inputs.update({f"{folder.name}/{camera}/{p.name}": p for p in list_images(folder / camera)})
+        return Material(stills, posed, folders, fps, inputs)
+
+
+def _taken_over(sources: Sources) -> tuple[tuple[list[Posed], PointTable] | None, dict[str, Path]]:
+    """Poses that somebody else found, and the files that say so, with their photos."""
+    if sources.kind == "mapping":
+        return None, {}
+    points = no_points()
+    if sources.colmap is not None and sources.images is not None:
+        folder = find_colmap(sources.colmap)
+        model = read_colmap(folder)
+        posed, points = from_model(model, photos_of_model(model, sources.images)), model.points
+        files = colmap_files(folder)
+    elif sources.transforms is not None:
+        posed, files = read_lens_transforms(sources.transforms), {"transforms": sources.transforms}
+    else:
+        assert sources.projections is not None and sources.images is not None
+        posed = read_projections(sources.projections, sources.images, sources.scale)
+        files = {f"images/{p.name}": p for p in list_images(sources.images)}
+        files.update({f"projections/{p.name}": p for p in matrix_files_of(sources.projections)})
+    return (posed, points), {**files, **{f"images/{shot.photo.name}": shot.photo.path for shot in posed}}
+
+
+def _sequences(sources: Sources) -> tuple[dict[Path, tuple[str, ...]], float | None]:
+    if sources.sequences is None:
+        return {}, sources.fps
+    root, fps = sources.sequences, sources.fps
+    if (root / MANIFEST).is_file():
+        found = read_manifest(root, "ingest")["results"].get("fps")
+        fps, root = fps if fps is not None else found, root / "sequences"
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder. Expected one folder per sequence in it, with one per camera.")
+    folders: dict[Path, tuple[str, ...]] = {}
+    for folder in sorted((p for p in root.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
+        cameras = sorted((p.name for p in folder.iterdir() if p.is_dir()), key=natural)
+        if cameras:
+            folders[folder] = tuple(cameras)
+    if not folders:
+        raise DataError(f"{root}: no sequences here. Expected folders like seq_000/cam_0 with frames.")
+    if fps is None or not 0 < fps < 1e4:
+        raise ConfigError(f"--fps: expected frames per second of the sequences, got {fps}.")
+    return folders, float(fps)
 
 
 def from_model(model: ColmapModel, photos: dict[str, Photo]) -> list[Posed]:
@@ -134,7 +246,8 @@ def read_projections(folder: Path, images: Path, scale: float) -> list[Posed]:
     ``00006.txt``, ``00006_P.txt`` or ``00006.P`` belongs to ``00006.jpg`` and to ``00006._c.jpg``.
 
     Raises:
-        DataError: fewer than three images have a matrix, two claim one, or a matrix is malformed or no camera's.
+        DataError: fewer than three images have a matrix, two claim one, or a matrix is malformed, no camera's, of
+            pixels that are askew, or of a centre far outside of its image.
         ConfigError: the scale is not positive.
     """
     if not 0 < scale < 1e3:
@@ -142,7 +255,19 @@ def read_projections(folder: Path, images: Path, scale: float) -> list[Posed]:
     posed: list[Posed] = []
     for image, matrix in match_matrices(folder, list_images(images)).items():
         photo = open_photo(image, image.name)
-        camera, viewmat = decompose(read_matrix(matrix), photo, scale, str(matrix))
+        k, viewmat = factors(matrix)
+        fx, fy, cx, cy = params = scale * k[[0, 1, 0, 1], [0, 1, 2, 2]]
+        skew = abs(k[0, 1] * scale) / fy * photo.height / 2
+        if skew > _SKEW_PIXELS:
+            raise DataError(
+                f"{matrix}: its pixels are askew by {skew:.1f} at the edge; expected a matrix without skew."
+            )
+        if not (0 < cx < photo.width and 0 < cy < photo.height):
+            raise DataError(
+                f"{matrix}: its centre is at pixel ({cx:.0f}, {cy:.0f}), the image is {photo.width}x{photo.height}. "
+                "Give --scale if the matrix is for another size."
+            )
+        camera = ColmapCamera("PINHOLE", photo.width, photo.height, params)
         posed.append(Posed(photo, camera, viewmat, np.empty((0, 2)), np.empty(0, np.int64)))
     return posed
 
@@ -187,12 +312,28 @@ def matrix_files_of(folder: Path) -> list[Path]:
     return found
 
 
-def read_matrix(path: Path) -> np.ndarray:
-    """A (3, 4) float64 matrix from text: twelve numbers, perhaps after a line ``CONTOUR``.
+def factors(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """K (3, 3) and viewmat (4, 4) of the projection matrix (3, 4) in a file, which is defined up to a factor.
 
     Raises:
-        DataError: it holds anything else.
+        DataError: the file holds anything else than twelve numbers, or they are no camera's.
     """
+    matrix = _read_matrix(path)
+    p = matrix * np.sign(np.linalg.det(matrix[:, :3]))
+    if not np.linalg.cond(p[:, :3]) < 1e9:
+        raise DataError(f"{path}: the matrix is singular; expected K [R | t] of a camera.")
+    k, rotation = scipy.linalg.rq(p[:, :3])
+    signs = np.sign(np.diag(k))
+    k, viewmat = k * signs, np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = signs[:, None] * rotation, np.linalg.solve(k, p[:, 3])
+    error = np.abs(k @ viewmat[:3] - p).max() / np.abs(p).max()
+    if not error < _DECOMPOSED or np.linalg.det(viewmat[:3, :3]) < 0:
+        raise DataError(f"{path}: cannot be decomposed into K [R | t]; expected the matrix of a camera.")
+    return k / k[2, 2], viewmat
+
+
+def _read_matrix(path: Path) -> np.ndarray:
+    """A (3, 4) float64 matrix from text: twelve numbers, perhaps after a line ``CONTOUR``."""
     if path.stat().st_size > 1 << 16:
         raise DataError(f"{path}: {path.stat().st_size} bytes are too many for a 3 x 4 matrix.")
     try:
@@ -203,41 +344,3 @@ def read_matrix(path: Path) -> np.ndarray:
     if len(values) != 12 or not (np.abs(values) < 1e12).all():
         raise DataError(f"{path}: expected 12 finite numbers, a 3 x 4 projection matrix, got {len(values)}.")
     return values.reshape(3, 4)
-
-
-def factors(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """K (3, 3) and viewmat (4, 4) of a projection matrix (3, 4) that is defined up to a factor.
-
-    Raises:
-        DataError: it is no camera's.
-    """
-    p = matrix * np.sign(np.linalg.det(matrix[:, :3]))
-    if not np.linalg.cond(p[:, :3]) < 1e9:
-        raise DataError(f"{where}: the matrix is singular; expected K [R | t] of a camera.")
-    k, rotation = scipy.linalg.rq(p[:, :3])
-    signs = np.sign(np.diag(k))
-    k, viewmat = k * signs, np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = signs[:, None] * rotation, np.linalg.solve(k, p[:, 3])
-    error = np.abs(k @ viewmat[:3] - p).max() / np.abs(p).max()
-    if not error < _DECOMPOSED or np.linalg.det(viewmat[:3, :3]) < 0:
-        raise DataError(f"{where}: cannot be decomposed into K [R | t]; expected the matrix of a camera.")
-    return k / k[2, 2], viewmat
-
-
-def decompose(matrix: np.ndarray, photo: Photo, scale: float, where: str) -> tuple[ColmapCamera, np.ndarray]:
-    """Camera and viewmat (4, 4) of a projection matrix (3, 4) for a photo ``scale`` times as large.
-
-    Raises:
-        DataError: it is no camera's, its pixels are askew, or its centre is far outside of the photo.
-    """
-    k, viewmat = factors(matrix, where)
-    fx, fy, cx, cy = k[0, 0] * scale, k[1, 1] * scale, k[0, 2] * scale, k[1, 2] * scale
-    skew = abs(k[0, 1] * scale) / fy * photo.height / 2
-    if skew > _SKEW_PIXELS:
-        raise DataError(f"{where}: its pixels are askew by {skew:.1f} at the edge; expected a matrix without skew.")
-    if not (0 < cx < photo.width and 0 < cy < photo.height):
-        raise DataError(
-            f"{where}: its centre is at pixel ({cx:.0f}, {cy:.0f}), the image is {photo.width}x{photo.height}. Give "
-            "--scale if the matrix is for another size."
-        )
-    return ColmapCamera("PINHOLE", photo.width, photo.height, np.array([fx, fy, cx, cy])), viewmat

@@ -88,8 +88,7 @@ def probe(path: Path) -> Film:
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(path, container)
-            pts, end = _stamps(path, container, stream)
-            _check_whole(path, container, end)
+            pts = _stamps(path, container, stream)
             time_base, declared = stream.time_base, stream.average_rate
             codec, sound = stream.codec_context.name, bool(container.streams.audio)
             label, count = _timecode_label(container, stream)
@@ -200,8 +199,8 @@ def _video_stream(path: Path, container: av.container.InputContainer) -> av.Vide
     raise DataError(f"{path}: holds no video stream.")
 
 
-def _stamps(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> tuple[np.ndarray, float]:
-    """Time stamps of the frames that are shown, and where the last packet of any stream ends [s]."""
+def _stamps(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> np.ndarray:
+    """Time stamps of the frames that are shown, of a film that is whole."""
     stamps, end = [], 0.0
     streams = [stream, *container.streams.audio[:1]]
     for packet in container.demux(streams):
@@ -221,16 +220,13 @@ def _stamps(path: Path, container: av.container.InputContainer, stream: av.Video
     pts = np.sort(np.array(stamps, np.int64))
     if (np.diff(pts) <= 0).any():
         raise DataError(f"{path}: several of its frames have one time stamp. Export it again.")
-    return pts, end
-
-
-def _check_whole(path: Path, container: av.container.InputContainer, end: float) -> None:
     declared = (container.duration or 0) / av.time_base
     if declared - end > 0.1:  # containers round; a film that was cut off lacks more
         raise DataError(
             f"{path}: is cut off: it says that it lasts {declared:.3f} s, its data end at {end:.3f} s. Copy it again "
             "from the camera, or cut it to what is there with a video editor."
         )
+    return pts
 
 
 def _rate(gaps: np.ndarray, declared: Fraction | None, time_base: float) -> Fraction:
@@ -282,18 +278,10 @@ def _timecode(label: str | None, count: int | None, rate: Fraction) -> tuple[Tim
     """The label at the rate that its own track counts (at 50 per second some cameras label by 25), or its fault."""
     if label is None:
         return None, None
-    try:
-        if count is not None:
-            for divisor in (1, 2, 4):
-                if _counts_to(label, rate / divisor, count):
-                    return parse_timecode(label, rate / divisor), None
-        return parse_timecode(label, rate), None
-    except DataError as error:
-        return None, str(error)
-
-
-def _counts_to(label: str, rate: Fraction, count: int) -> bool:
-    try:
-        return parse_timecode(label, rate).frame == count
-    except DataError:
-        return False
+    found: list[tuple[Timecode | None, str | None]] = []
+    for divisor in (1, 2, 4):
+        try:
+            found.append((parse_timecode(label, rate / divisor), None))
+        except DataError as error:
+            found.append((None, str(error)))
+    return next((each for each in found if each[0] is not None and each[0].frame == count), found[0])

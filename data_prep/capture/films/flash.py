@@ -30,16 +30,6 @@ class Flash:
     resolution: float  # what the pictures can tell of it [s]
 
 
-@dataclass(frozen=True)
-class FlashLag:
-    """A measured difference of starts."""
-
-    seconds: float  # by how much the second film began later [s]
-    spread: float  # largest disagreement between flashes [s]
-    resolution: float  # what they can tell [s]
-    count: int  # how many both films saw
-
-
 def brightness(gray: np.ndarray) -> float:
     """Mean of an (H, W) uint8 picture in linear light, 0..1."""
     return float(np.bincount(gray.reshape(-1), minlength=256) @ _LINEAR / gray.size)
@@ -78,8 +68,11 @@ def flashes(levels: np.ndarray, times: np.ndarray, *, interval: float, shutter: 
     return found
 
 
-def flash_lag(first: list[Flash], second: list[Flash], *, interval: float) -> FlashLag:
+def flash_lag(first: list[Flash], second: list[Flash], *, interval: float) -> tuple[float, float, float]:
     """By how much the second film began later than the first, from the flashes that both saw.
+
+    Returns:
+        The difference of starts, the largest disagreement between flashes, and what they can tell apart, all in [s].
 
     Raises:
         DataError: their flashes can be matched in several ways.
@@ -95,7 +88,7 @@ def flash_lag(first: list[Flash], second: list[Flash], *, interval: float) -> Fl
         )
     differences = np.array([a.seconds - b.seconds for a, b in best[0]])
     resolution = max(a.resolution + b.resolution for a, b in best[0])
-    return FlashLag(float(differences.mean()), float(np.ptp(differences)), resolution, most)
+    return float(differences.mean()), float(np.ptp(differences)), resolution
 
 
 def _edge(levels: np.ndarray, times: np.ndarray, k: int, interval: float, shutter: float) -> Flash:
@@ -103,17 +96,13 @@ def _edge(levels: np.ndarray, times: np.ndarray, k: int, interval: float, shutte
     below, above = levels[k - 1], levels[k + 1]
     after = levels[k + 2 : k + 4]
     if len(after) and after.min() < below + 0.5 * (above - below):
-        return _short(levels, times, k, below, interval, shutter)
+        # A flash of a frame or two: the middle of its light, known to half a frame.
+        span = slice(k - 1, k + 3)
+        light = np.clip(levels[span] - below, 0, None)
+        middle = float((light * times[span]).sum() / light.sum()) + 0.5 * shutter * interval
+        return Flash(middle, 0.5 * interval)
     seen = float(np.clip((levels[k] - below) / max(above - below, 1e-12), 0.0, 1.0))
     return Flash(float(times[k]) + (1 - seen) * shutter * interval, 0.1 * interval)
-
-
-def _short(levels: np.ndarray, times: np.ndarray, k: int, below: float, interval: float, shutter: float) -> Flash:
-    """A flash of a frame or two: the middle of its light, known to half a frame."""
-    span = slice(max(k - 1, 0), k + 3)
-    light = np.clip(levels[span] - below, 0, None)
-    middle = float((light * times[span]).sum() / light.sum()) + 0.5 * shutter * interval
-    return Flash(middle, 0.5 * interval)
 
 
 def _matched(first: list[Flash], second: list[Flash], lag: float, within: float) -> list[tuple[Flash, Flash]]:

@@ -25,13 +25,11 @@ def write_sheet(path: Path, thumbnails: Mapping[str, Sequence[np.ndarray]], foun
 
     Peaks of motion lie above each other where the films are synchronised.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = min(len(frames) for frames in thumbnails.values())
     moments = np.unique(np.linspace(0, count - 1, MOMENTS).astype(int))
     figure = Figure(figsize=(11, 1.4 * len(thumbnails) + 3.2), layout="constrained")
-    FigureCanvasAgg(figure)
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.4 * len(thumbnails), 3.0])
     upper, lower = parts
     axes = upper.subplots(len(thumbnails), len(moments), squeeze=False)

@@ -60,24 +60,23 @@ def sound_lag(first: np.ndarray, second: np.ndarray, rate: int) -> Lag:
     peaks = sorted(peaks - 1, key=lambda i: -scores[i])[:CANDIDATES]
     if not peaks:
         raise DataError("its sound is as loud all the time; nothing tells where it belongs.")
-    found = [(*_refined(a, b, lags[i] / ENVELOPE_RATE, rate), float(scores[i])) for i in peaks]
-    return _clearest(found)
+    return _clearest([Lag(*_refined(a, b, lags[i] / ENVELOPE_RATE, rate), float(scores[i])) for i in peaks])
 
 
-def _clearest(found: list[tuple[float, float, float, float]]) -> Lag:
-    """The candidate (lag, spread, sharpness, likeness) that stands out, by the sound itself or by its loudness."""
-    by_sound = sorted(found, key=lambda c: -c[2])
-    others = [c[2] for c in by_sound[1:] if abs(c[0] - by_sound[0][0]) > APART]
-    if by_sound[0][2] >= SHARP and by_sound[0][2] >= CLEARER * max(others, default=0.0):
-        return Lag(*by_sound[0])
-    best, *rest = found
-    rivals = [c[3] for c in rest if abs(c[0] - best[0]) > APART]
-    if best[3] >= LIKE and best[3] >= LOUDER * max(rivals, default=0.0):
-        return Lag(*best)
+def _clearest(found: list[Lag]) -> Lag:
+    """The candidate that stands out, by the sound itself or by its loudness."""
+    sharp = max(found, key=lambda lag: lag.sharpness)
+    blunter = max((lag.sharpness for lag in found if abs(lag.seconds - sharp.seconds) > APART), default=0.0)
+    if sharp.sharpness >= SHARP and sharp.sharpness >= CLEARER * blunter:
+        return sharp
+    like = found[0]
+    less_like = max((lag.likeness for lag in found if abs(lag.seconds - like.seconds) > APART), default=0.0)
+    if like.likeness >= LIKE and like.likeness >= LOUDER * less_like:
+        return like
     raise DataError(
-        f"its sound does not tell where it belongs (sharpness {by_sound[0][2]:.1f}, needed {SHARP:g} and {CLEARER:g} "
-        f"times the next, {max(others, default=0.0):.1f}; likeness of loudness {best[3]:.2f}, needed {LIKE:g} and "
-        f"{LOUDER:g} times the next, {max(rivals, default=0.0):.2f})."
+        f"its sound does not tell where it belongs (sharpness {sharp.sharpness:.1f}, needed {SHARP:g} and {CLEARER:g} "
+        f"times the next, {blunter:.1f}; likeness of loudness {like.likeness:.2f}, needed {LIKE:g} and "
+        f"{LOUDER:g} times the next, {less_like:.2f})."
     )
 
 

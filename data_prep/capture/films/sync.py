@@ -181,23 +181,17 @@ def _by_flash(films: Mapping[str, Film], shutter: float) -> Offsets:
     found: dict[str, list[Flash]] = {}
     for name, film in films.items():
         with _naming(name, films):
-            interval = 1 / float(film.rate)
-            found[name] = flashes(brightness_curve(film), film.times, interval=interval, shutter=shutter)
+            levels = np.full(len(film), np.nan)
+            for i, frame in pictures(film):
+                levels[i] = brightness(frame.to_ndarray(format="gray"))
+            found[name] = flashes(levels, film.times, interval=1 / float(film.rate), shutter=shutter)
     (base, reference), *others = films.items()
     seconds, spread, resolution = {base: 0.0}, {base: 0.0}, {base: 0.0}
     for name, film in others:
         with _naming(name, films, base):
-            lag = flash_lag(found[base], found[name], interval=1 / float(min(film.rate, reference.rate)))
-        seconds[name], spread[name], resolution[name] = lag.seconds, lag.spread, lag.resolution
+            interval = 1 / float(min(film.rate, reference.rate))
+            seconds[name], spread[name], resolution[name] = flash_lag(found[base], found[name], interval=interval)
     return Offsets("flash", seconds, spread, resolution)
-
-
-def brightness_curve(film: Film) -> np.ndarray:
-    """Mean brightness of each of the N frames in linear light, 0..1."""
-    levels = np.full(len(film), np.nan)
-    for i, frame in pictures(film):
-        levels[i] = brightness(frame.to_ndarray(format="gray"))
-    return levels
 
 
 def _checked_by_sound(films: Mapping[str, Film], found: Offsets) -> Offsets:

@@ -68,13 +68,17 @@ def find_takes(path: Path) -> list[Take]:
     else:
         raise DataError(f"{path}: expected a folder of films, or a list file (.json).")
     cameras = sorted(named[0][1], key=natural)
-    for name, films, _ in named:
+    labels = {f"cam_{i}": label for i, label in enumerate(cameras)}
+    takes = []
+    for i, (name, films, extra) in enumerate(named):
         if set(films) != set(cameras):
             raise DataError(
                 f"{path}: sequence '{name}' has the cameras {sorted(films, key=natural)}, '{named[0][0]}' has "
                 f"{cameras}. Name the films alike in every sequence, or say which is which in a list file (see --help)."
             )
-    return [_take(i, name, films, cameras, extra) for i, (name, films, extra) in enumerate(named)]
+        by_camera = {camera: films[label] for camera, label in labels.items()}
+        takes.append(Take(f"seq_{i:03d}", name, by_camera, labels, **extra))
+    return takes
 
 
 def offset_seconds(text: str, rate: float) -> float:
@@ -88,19 +92,6 @@ def offset_seconds(text: str, rate: float) -> float:
     if match is None or not math.isfinite(value):
         raise DataError(f"offset {text!r}: expected seconds such as 0.146, or frames such as 7.3f.")
     return value / rate if match[2] == "f" else value
-
-
-def _take(index: int, name: str, films: Mapping[str, Path], cameras: list[str], extra: Mapping[str, Any]) -> Take:
-    ids = {label: f"cam_{i}" for i, label in enumerate(cameras)}
-    return Take(
-        name=f"seq_{index:03d}",
-        source=name,
-        films={ids[label]: films[label] for label in cameras},
-        labels={ids[label]: label for label in cameras},
-        offsets=extra.get("offsets", {}),
-        start=extra.get("start"),
-        duration=extra.get("duration"),
-    )
 
 
 def _folders(path: Path) -> list[tuple[str, Path]]:

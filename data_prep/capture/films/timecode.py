@@ -29,11 +29,6 @@ class Timecode:
     rate: Fraction  # frames that are shown per second, exactly
 
     @property
-    def clock(self) -> tuple[bool, bool]:
-        """Time codes can be compared where this agrees: do labels drop, and is a labelled second 1.001 s long?"""
-        return self.drop, self.rate.denominator != 1
-
-    @property
     def seconds(self) -> Fraction:
         """Time since the label 00:00:00:00 was shown [s], exactly."""
         return self.frame / self.rate
@@ -44,14 +39,14 @@ class Timecode:
         Raises:
             DataError: the two count differently, so that their difference means nothing.
         """
-        if self.clock != other.clock:
-            raise DataError(f"time codes {self.describe()} and {other.describe()} do not count alike.")
+        # At a rate that is no whole number a labelled second is longer than a second.
+        if self.drop != other.drop or (self.rate.denominator == 1) != (other.rate.denominator == 1):
+            raise DataError(f"time codes {self._described()} and {other._described()} do not count alike.")
         day = frames_of_label(24, 0, 0, 0, base=self.base, drop=self.drop) / self.rate
         difference = (self.seconds - other.seconds) % day
         return difference - day if difference > day / 2 else difference
 
-    def describe(self) -> str:
-        """The label with what it counts, for messages."""
+    def _described(self) -> str:
         return f"{self.text} ({'drop' if self.drop else 'non-drop'} frame, {float(self.rate):.6g} per second)"
 
 

@@ -15,7 +15,7 @@ from data_prep.common.photos import SUFFIXES, natural, write_image
 from gausim.core import DataError
 from gausim.io.pixels import decode
 
-# Pictures that stages draw for people, and the file that lies beside them.
+# Pictures that stages draw for people, and the record that lies beside them.
 SHEETS = {"sync.png": "sync.json", "cameras.png": "stage.json"}
 
 
@@ -60,7 +60,8 @@ def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
     for path in root.rglob("*"):
         relative = path.relative_to(root)
         hidden = any(part.startswith(".") for part in relative.parts)
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden and not _drawn_by_a_stage(path):
+        drawn = path.name in SHEETS and (path.parent / SHEETS[path.name]).is_file()
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden and not drawn:
             folders.setdefault(relative.parent.as_posix().removeprefix("."), []).append(relative)
     if not folders:
         raise DataError(f"{root}: no pictures in it. Pictures are files such as {', '.join(SUFFIXES[:4])}.")
@@ -73,11 +74,6 @@ def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
         moving = kind == "film" or (kind == "auto" and "sequences" in Path(name).parts)
         clips.append(Clip(name, root, tuple(paths[::every]), moving))
     return clips
-
-
-def _drawn_by_a_stage(path: Path) -> bool:
-    """Whether a picture is a stage's report: it lies beside the record of that stage."""
-    return path.name in SHEETS and (path.parent / SHEETS[path.name]).is_file()
 
 
 def film_frames(film: Path, folder: Path) -> None:

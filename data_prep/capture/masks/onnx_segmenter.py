@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +12,29 @@ import numpy as np
 
 from data_prep.capture.masks.clips import Clip
 from data_prep.capture.masks.segmenters import MaskOf
+from data_prep.common.command import Options, numbers, option
 from gausim.core import ConfigError, DataError
 
 ACTIVATIONS = ("none", "sigmoid", "minmax")
 
 
+@dataclass(frozen=True)
+class NetworkOptions(Options):
+    """Of the backend onnx."""
+
+    onnx: Path | None = option(None, "a salient-object network, [1, 3, H, W] to a map", metavar="FILE")
+    onnx_size: int | None = option(None, "side of its input, where the file leaves it open", least=16, metavar="PIXELS")
+    onnx_mean: tuple[float, ...] = option((128.0,), "taken from RGB in 0..255 (128)", type=numbers, metavar="M[,M,M]")
+    onnx_scale: tuple[float, ...] = option((256.0,), "what is left is divided by it (256)", type=numbers,
+                                           metavar="S[,S,S]")  # fmt: skip
+    onnx_output: int = option(0, "which output is the mask (%(default)s)", least=0)
+    onnx_activation: str = option("none", "what makes it 0..1 (%(default)s)", choices=ACTIVATIONS)
+
+
 class OnnxSegmenter:
     """Any network that maps one picture, (1, 3, H, W) float32, to one map of saliency."""
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        size: int | None = None,
-        mean: tuple[float, ...] = (128.0,),
-        scale: tuple[float, ...] = (256.0,),
-        output: int = 0,
-        activation: str = "none",
-    ) -> None:
+    def __init__(self, options: NetworkOptions) -> None:
         """Loads the network.
 
         Raises:
@@ -39,29 +45,28 @@ class OnnxSegmenter:
             import onnxruntime
         except ImportError as error:
             raise ConfigError("onnxruntime runs this backend. Install it: `pip install 'gausim[segment]'`.") from error
-        if not path.is_file():
+        path = options.onnx
+        if path is None or not path.is_file():
             raise DataError(f"{path}: no such network.")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
-        options.log_severity_level = 3
+        session = onnxruntime.SessionOptions()
+        session.intra_op_num_threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
+        session.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(str(path), session, providers=["CPUExecutionProvider"])
         except Exception as error:  # its exceptions have no common base
             raise DataError(f"{path}: cannot be loaded as an ONNX network ({error}).") from error
-        self._path, self._output, self._activation = path, output, activation
+        mean, scale = options.onnx_mean, options.onnx_scale
+        self._path, self._output, self._activation = path, options.onnx_output, options.onnx_activation
         self._mean, self._scale = np.asarray(mean, np.float32), np.asarray(scale, np.float32)
-        self._size = self._input_size(size)
+        self._size = self._input_size(options.onnx_size)
         outputs = self._session.get_outputs()
-        if not 0 <= output < len(outputs):
-            raise ConfigError(f"{path}: has outputs 0 to {len(outputs) - 1}, asked for {output}.")
-        if activation not in ACTIVATIONS or len(mean) not in (1, 3) or len(scale) not in (1, 3) or 0 in scale:
-            raise ConfigError(
-                f"{path}: expected an activation of {ACTIVATIONS}, one or three means and scales that are not 0; got "
-                f"'{activation}', {mean}, {scale}."
-            )
+        if self._output >= len(outputs):
+            raise ConfigError(f"{path}: has outputs 0 to {len(outputs) - 1}, asked for {self._output}.")
+        if len(mean) not in (1, 3) or len(scale) not in (1, 3) or 0 in scale:
+            raise ConfigError(f"{path}: expected one or three means and scales that are not 0; got {mean}, {scale}.")
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`data_prep.capture.masks.segmenters.Segmenter`."""
+        """See :class:`data_prep.capture.masks.segmenters.Backend`."""
         return lambda index: self.mask(clip.rgb(index))
 
     def mask(self, rgb: np.ndarray) -> np.ndarray:

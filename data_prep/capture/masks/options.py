@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup
-from data_prep.capture.masks.onnx_segmenter import OnnxSegmenter
-from data_prep.capture.masks.sam2_segmenter import Sam2Segmenter, load_predictor, make_prompt, read_prompts
-from data_prep.capture.masks.segmenters import AlphaSegmenter, Backend, BackgroundSegmenter, ChromaSegmenter
-from data_prep.common.command import Options, add_options, option
+from data_prep.capture.masks.onnx_segmenter import NetworkOptions, OnnxSegmenter
+from data_prep.capture.masks.sam2_segmenter import Sam2Segmenter, load_predictor, make_prompt
+from data_prep.capture.masks.segmenters import Backend, BackgroundSegmenter, ChromaSegmenter, alpha_masks
+from data_prep.common.command import Options, numbers, option
 from gausim.core import ConfigError
+from gausim.io.plain_json import read_json
 
 BACKENDS = ("alpha", "background", "chroma", "onnx", "sam2")
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    """Finite numbers between commas."""
-    values = tuple(float(part) for part in text.split(","))
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError("must be finite")
-    return values
 
 
 def colour(text: str) -> tuple[int, int, int]:
@@ -45,19 +37,6 @@ class ScreenOptions(Options):
         None, "colour of the screen (that of the picture's border)", type=colour, metavar="RRGGBB"
     )
     no_grabcut: bool = option(False, "leave the masks as the difference gives them")
-
-
-@dataclass(frozen=True)
-class NetworkOptions(Options):
-    """Of the backend onnx."""
-
-    onnx: Path | None = option(None, "a salient-object network, [1, 3, H, W] to a map", metavar="FILE")
-    onnx_size: int | None = option(None, "side of its input, where the file leaves it open", least=16, metavar="PIXELS")
-    onnx_mean: tuple[float, ...] = option((128.0,), "taken from RGB in 0..255 (128)", type=numbers, metavar="M[,M,M]")
-    onnx_scale: tuple[float, ...] = option((256.0,), "what is left is divided by it (256)", type=numbers,
-                                           metavar="S[,S,S]")  # fmt: skip
-    onnx_output: int = option(0, "which output is the mask (%(default)s)", least=0)
-    onnx_activation: str = option("none", "what makes it 0..1 (%(default)s)", choices=("none", "sigmoid", "minmax"))
 
 
 @dataclass(frozen=True)
@@ -83,21 +62,6 @@ GROUPS = {
 }
 
 
-def add_segment_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of cleaning and of all backends."""
-    cleaning = parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)")
-    add_options(cleaning, Cleanup, unset=True)
-    for title, kind in GROUPS.items():
-        add_options(parser.add_argument_group(title), kind)
-
-
-def make_cleanup(arguments: argparse.Namespace) -> Cleanup:
-    """Options for the cleaning of masks; their defaults depend on the backend."""
-    usual = UNTOUCHED if arguments.backend == "alpha" else Cleanup()
-    given = {each.name: getattr(arguments, each.name) for each in fields(Cleanup)}
-    return Cleanup(**{name: getattr(usual, name) if value is None else value for name, value in given.items()})
-
-
 def make_backend(name: str, screen: ScreenOptions, network: NetworkOptions, tracker: TrackerOptions) -> Backend:
     """The backend of a name.
 
@@ -110,36 +74,39 @@ def make_backend(name: str, screen: ScreenOptions, network: NetworkOptions, trac
         return _background(screen.plate, screen.threshold, refine)
     if name == "chroma":
         settings = {"key": screen.key, "grabcut": refine}
-        return Backend("chroma", lambda: ChromaSegmenter(screen.key, grabcut=refine), settings=settings)
+        return Backend("chroma", ChromaSegmenter(screen.key, refine).open, settings=settings)
     if name == "onnx":
         return _onnx(network)
-    return _sam2(tracker) if name == "sam2" else Backend("alpha", AlphaSegmenter, soft=True)
+    return _sam2(tracker) if name == "sam2" else Backend("alpha", alpha_masks, soft=True)
 
 
 def _background(plate: Path | None, threshold: float | None, refine: bool) -> Backend:
     plates = [] if plate is None else sorted(p for p in plate.rglob("*") if p.is_file()) if plate.is_dir() else [plate]
     return Backend(
         "background",
-        lambda: BackgroundSegmenter(plate, threshold, refine),
+        BackgroundSegmenter(plate, threshold, refine).open,
         settings={"plate": None if plate is None else plate.name, "threshold": threshold, "grabcut": refine},
         inputs={p.name if p == plate else p.relative_to(plate).as_posix(): p for p in plates},  # type: ignore[arg-type]
     )
 
 
 def _onnx(chosen: NetworkOptions) -> Backend:
-    path = chosen.onnx
-    if path is None:
+    if chosen.onnx is None:
         raise ConfigError("--backend onnx: name the network with --onnx FILE.")
     names = ("size", "mean", "scale", "output", "activation")
     settings: dict[str, Any] = {name: getattr(chosen, f"onnx_{name}") for name in names}
-    make = lambda: OnnxSegmenter(path, **settings)  # noqa: E731
-    return Backend("onnx", make, True, settings, {"network": path}, ("onnxruntime",))
+    # Loaded once, and only if there is something to do.
+    network = cache(OnnxSegmenter)
+    return Backend(
+        "onnx", lambda clip: network(chosen).open(clip), True, settings, {"network": chosen.onnx}, ("onnxruntime",)
+    )
 
 
 def _sam2(chosen: TrackerOptions) -> Backend:
     if chosen.sam2_checkpoint is None:
         raise ConfigError("--backend sam2: name the weights with --sam2-checkpoint FILE.")
-    prompts = read_prompts(chosen.prompts) if chosen.prompts else {}
+    listed = read_json(chosen.prompts) if chosen.prompts else {}
+    prompts = {name: make_prompt(entry, f"{chosen.prompts}: '{name}'") for name, entry in listed.items()}
     if chosen.box or chosen.point:
         prompts[""] = make_prompt({"box": chosen.box, "points": chosen.point}, "--box, --point")
     if not prompts:
@@ -147,7 +114,7 @@ def _sam2(chosen: TrackerOptions) -> Backend:
     predictor = load_predictor(chosen.sam2_checkpoint, chosen.sam2_config, device=chosen.device)
     return Backend(
         "sam2",
-        lambda: Sam2Segmenter(predictor, prompts, device=chosen.device),
+        Sam2Segmenter(predictor, prompts, device=chosen.device).open,
         soft=True,
         settings={
             "config": chosen.sam2_config,

@@ -18,7 +18,7 @@ from msgspec import Struct
 from data_prep.capture.masks.clips import Clip
 from data_prep.capture.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
-from gausim.io.plain_json import checked, read_json
+from gausim.io.plain_json import checked
 
 # The predictor reads JPEG files only; at this quality they differ from the frames by less than a camera's noise.
 JPEG_QUALITY = 98
@@ -32,27 +32,23 @@ class Prompt(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sam2Segmenter:
-    """SAM 2's video predictor behind the protocol of :class:`data_prep.capture.masks.segmenters.Segmenter`."""
+    """SAM 2's video predictor."""
 
     def __init__(self, predictor: Any, prompts: Mapping[str, Prompt], *, device: str = "cpu") -> None:
         """Takes a ``sam2.sam2_video_predictor.SAM2VideoPredictor`` and prompts by clip."""
         self._predictor, self._prompts, self._device = predictor, prompts, device
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`~data_prep.capture.masks.segmenters.Segmenter`; pictures are followed once, in order."""
+        """See :class:`~data_prep.capture.masks.segmenters.Backend`; pictures are followed once, in order."""
         height, width = clip.rgb(0).shape[:2]
         prompt = _fitting(self._prompts.get(clip.name, self._prompts.get("")), clip, width, height)
         masks = self._follow(clip, prompt, (height, width))
-        done: dict[str, Any] = {"index": -1, "mask": None}
 
         def mask(index: int) -> np.ndarray:
-            if index < done["index"]:
-                raise ValueError(f"masks are asked for in order, got {index} after {done['index']}")
-            while done["index"] < index:
-                done["index"], done["mask"] = next(masks)
-            found = done["mask"]
-            assert isinstance(found, np.ndarray)
-            return found
+            for number, found in masks:
+                if number == index:
+                    return found
+            raise ValueError(f"masks are asked for once and in order, which {index} is not")
 
         return mask
 
@@ -116,15 +112,6 @@ def load_predictor(checkpoint: Path, config: str, *, device: str) -> Any:
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(f"{checkpoint}: does not fit the configuration '{config}' ({error}).") from error
     return predictor
-
-
-def read_prompts(path: Path) -> dict[str, Prompt]:
-    """Prompts of several clips: ``{"sequences/seq_000/cam_0": {"box": [x0, y0, x1, y1], "points": [[x, y, 1]]}}``.
-
-    Raises:
-        DataError: the file is missing or malformed.
-    """
-    return {name: make_prompt(entry, f"{path}: '{name}'") for name, entry in read_json(path).items()}
 
 
 def make_prompt(given: Any, where: str) -> Prompt:

@@ -1,11 +1,11 @@
-"""Foreground masks: the protocol that every backend obeys, and the backends that need OpenCV alone."""
+"""Foreground masks: what every backend gives, and the backends that need OpenCV alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +19,8 @@ MaskOf = Callable[[int], np.ndarray]
 MEDIAN_FRAMES = 41
 # A difference in CIE Lab counts from here on, and from so many times the noise; 2.3 is just noticeable.
 LEAST_DIFFERENCE, OVER_NOISE = 7.0, 5.0
+# Distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not.
+SCREEN, OBJECT = 14.0, 32.0
 GRABCUT_SIDE = 480
 GRABCUT_ROUNDS = 3
 
@@ -28,40 +30,27 @@ class Backend:
     """A way to tell foreground from background, with what its result depends on."""
 
     name: str  # of the backend
-    make: Callable[[], Segmenter]  # makes the segmenter; called once, and only if there is something to do
+    # Looks at a clip and returns what gives a picture's mask. That is called with rising indices, not necessarily all
+    # of them, and returns (H, W) float32 in 0..1, 1 being foreground.
+    open: Callable[[Clip], MaskOf]
     soft: bool = False  # masks have soft edges of their own; others are softened along the picture's edges
     settings: Mapping[str, Any] = field(default_factory=dict)  # what was chosen (plain data)
     inputs: Mapping[str, Path] = field(default_factory=dict)  # files it reads besides the pictures
     packages: tuple[str, ...] = ()  # libraries whose versions may matter
 
 
-class Segmenter(Protocol):
-    """Tells foreground from background."""
+def alpha_masks(clip: Clip) -> MaskOf:
+    """The alpha channel that the pictures have already; a picture without any transparency is refused."""
 
-    def open(self, clip: Clip) -> MaskOf:
-        """Looks at a clip and returns what gives a picture's mask.
+    def mask(index: int) -> np.ndarray:
+        alpha = clip.rgba(index)[..., 3]
+        if alpha.min() == 255:
+            raise DataError(
+                f"{clip.file(index)}: has no transparent pixel, so its alpha is no mask. Choose another --backend."
+            )
+        return alpha.astype(np.float32) / 255
 
-        It is called with rising indices, not necessarily all of them, and returns (H, W) float32 in 0..1, 1 being
-        foreground.
-        """
-
-
-@dataclass(frozen=True)
-class AlphaSegmenter:
-    """The alpha channel that the pictures have already."""
-
-    def open(self, clip: Clip) -> MaskOf:
-        """See :class:`Segmenter`; a picture without any transparency is refused."""
-
-        def mask(index: int) -> np.ndarray:
-            alpha = clip.rgba(index)[..., 3]
-            if alpha.min() == 255:
-                raise DataError(
-                    f"{clip.file(index)}: has no transparent pixel, so its alpha is no mask. Choose another --backend."
-                )
-            return alpha.astype(np.float32) / 255
-
-        return mask
+    return mask
 
 
 @dataclass(frozen=True)
@@ -78,46 +67,43 @@ class BackgroundSegmenter:
     grabcut: bool = True  # refine by GrabCut
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`Segmenter`."""
+        """See :class:`Backend`."""
         if self.plate is None and (not clip.moving or len(clip) < 3):
             raise DataError(
                 f"{clip.root / clip.name}: a median over time needs a film of at least 3 frames of a camera that "
                 "stands still. Give a picture of the empty scene with --plate, or choose another --backend."
             )
         chosen = sampled(len(clip), MEDIAN_FRAMES)
-        background = lab(self._plate(clip)) if self.plate else lab(median_picture(clip, chosen))
+        background = lab(_read_plate(self.plate, clip) if self.plate else median_picture(clip, chosen))
         differences = [difference(lab(clip.rgb(i)), background, clip, i) for i in chosen]
         noise = 1.4826 * float(np.median([np.median(d) for d in differences]))
         threshold = self.threshold or max(LEAST_DIFFERENCE, OVER_NOISE * noise)
         # Where anything ever moved: with a median, the object is somewhere in there and nowhere else.
-        ever = np.max(differences, axis=0) > threshold
+        ever = None if self.plate else np.max(differences, axis=0) > threshold
 
         def mask(index: int) -> np.ndarray:
             rgb = clip.rgb(index)
             far = difference(lab(rgb), background, clip, index)
             if not self.grabcut:
                 return np.clip((far - 0.5 * threshold) / threshold, 0, 1).astype(np.float32)
-            return grabcut(rgb, trimap(far, threshold, sure=self.plate is not None, ever=None if self.plate else ever))
+            return grabcut(rgb, trimap(far, threshold, ever=ever))
 
         return mask
 
-    def _plate(self, clip: Clip) -> np.ndarray:
-        assert self.plate is not None
-        path = self.plate
-        if path.is_dir():
-            names = (clip.name, Path(clip.name).name)
-            found = [path / f"{n}{end}" for n in names for end in (".png", ".jpg") if (path / f"{n}{end}").is_file()]
-            if not found:
-                raise DataError(f"{path}: no picture of the empty scene for '{clip.name}', expected {names[1]}.png.")
-            path = found[0]
-        plate = read_picture(path)[..., :3]
-        if plate.shape != clip.rgb(0).shape:
-            shape = clip.rgb(0).shape
-            raise DataError(
-                f"{path}: is {plate.shape[1]}x{plate.shape[0]}, the pictures of '{clip.name}' are "
-                f"{shape[1]}x{shape[0]}."
-            )
-        return np.ascontiguousarray(plate)
+
+def _read_plate(path: Path, clip: Clip) -> np.ndarray:
+    if path.is_dir():
+        names = (clip.name, Path(clip.name).name)
+        found = [path / f"{n}{end}" for n in names for end in (".png", ".jpg") if (path / f"{n}{end}").is_file()]
+        if not found:
+            raise DataError(f"{path}: no picture of the empty scene for '{clip.name}', expected {names[1]}.png.")
+        path = found[0]
+    plate, shape = read_picture(path)[..., :3], clip.rgb(0).shape
+    if plate.shape != shape:
+        raise DataError(
+            f"{path}: is {plate.shape[1]}x{plate.shape[0]}, the pictures of '{clip.name}' are {shape[1]}x{shape[0]}."
+        )
+    return np.ascontiguousarray(plate)
 
 
 @dataclass(frozen=True)
@@ -125,12 +111,10 @@ class ChromaSegmenter:
     """Pixels whose hue differs from that of a screen."""
 
     key: tuple[int, int, int] | None = None  # the screen's colour (RGB, 0..255); that of the picture's border when None
-    # distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not
-    tolerance: tuple[float, float] = (14.0, 32.0)
     grabcut: bool = True  # refine by GrabCut
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`Segmenter`."""
+        """See :class:`Backend`."""
         first = lab(clip.rgb(0))
         border = np.concatenate([first[0], first[-1], first[:, 0], first[:, -1]])
         key = np.median(border, axis=0) if self.key is None else lab(np.full((1, 1, 3), self.key, np.uint8))[0, 0]
@@ -139,12 +123,11 @@ class ChromaSegmenter:
                 f"{clip.file(0)}: the screen's colour is nearly grey, so hue tells nothing. State it with --key, or "
                 "choose another --backend."
             )
-        low, high = self.tolerance
 
         def mask(index: int) -> np.ndarray:
             rgb = clip.rgb(index)
             distance = np.linalg.norm(lab(rgb)[..., 1:] - key[1:], axis=-1)
-            soft = np.clip((distance - low) / (high - low), 0, 1).astype(np.float32)
+            soft = np.clip((distance - SCREEN) / (OBJECT - SCREEN), 0, 1).astype(np.float32)
             if not self.grabcut:
                 return soft
             marks = np.where(soft > 0.5, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -178,19 +161,19 @@ def median_picture(clip: Clip, indices: Sequence[int]) -> np.ndarray:
     return np.median(pictures, axis=0).astype(np.uint8)
 
 
-def trimap(far: np.ndarray, threshold: float, *, sure: bool, ever: np.ndarray | None) -> np.ndarray:
-    """GrabCut's marks from (H, W) differences."""
-    side = max(far.shape)
-    margin = max(3, round(0.02 * side)) | 1
+def trimap(far: np.ndarray, threshold: float, *, ever: np.ndarray | None) -> np.ndarray:
+    """GrabCut's marks from (H, W) differences: the object is where they are large.
+
+    Differences from a median are no sure sign; with one the object is where anything ``ever`` moved, (H, W) bool.
+    """
+    margin = max(3, round(0.02 * max(far.shape))) | 1
     marks = np.full(far.shape, cv2.GC_BGD, np.uint8)
-    moved = cv2.morphologyEx((far > threshold).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    region = (
-        moved if ever is None else cv2.morphologyEx(ever.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    )
+    possible = (far > threshold if ever is None else ever).astype(np.uint8)
+    region = cv2.morphologyEx(possible, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     near = cv2.dilate(region, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1)))
     marks[near > 0] = cv2.GC_PR_BGD
     marks[region > 0] = cv2.GC_PR_FGD
-    if sure:
+    if ever is None:
         core = cv2.erode((far > 2 * threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
         marks[core > 0] = cv2.GC_FGD
     return marks
