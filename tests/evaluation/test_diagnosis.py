@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.report.gather.diagnosis import read_diagnosis
-from gausim.report.pictures.motion import diagnosis_figure, diagnosis_plot
+from gausim.report.pictures.figures import diagnosis_figure, diagnosis_plot
 from gausim.results.curves import TRUTH
-from gausim.results.diagnosis import Diagnosis
+from gausim.results.diagnosis import Diagnosis, read_diagnosis
 
 FPS, FRAMES = 24.0, 61
 REST = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))

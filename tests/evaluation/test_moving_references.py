@@ -13,7 +13,6 @@ from gausim.core import Trajectory
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.render.reference import ReferenceRenderer
-from gausim.results.summary import frame_splits
 
 FLOOR, GRAVITY, LANDED = 0.0, 6.0, 8
 
@@ -103,13 +102,3 @@ def test_a_body_in_hands_is_compared_with_following_them(tmp_path):
     assert curves.facts.reference == "follow hands"
     # One hand carries the whole body: the reference is right.
     assert np.nanmax(curves.values["follow hands"]["error_3d"]) < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("frames", "first", "unseen", "longer"),
-    [(60, 16, (16, 50), (16, 60)), (50, 16, (16, 50), None), (60, 42, (42, 60), None), (90, 63, (63, 90), None)],
-)
-def test_the_last_third_of_a_recording_is_one_range(frames, first, unseen, longer):
-    splits = frame_splits(frames, first)
-    assert splits["unseen"] == unseen and splits.get("unseen_all") == longer
-    assert splits["unseen_near"][1] <= unseen[1]

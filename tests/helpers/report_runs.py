@@ -9,6 +9,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import Study, make_study
+from gausim.report.tables.overview import make_sheets
+from gausim.report.tables.sheets import Sheet
+from gausim.report.write import write_report
 from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, save_curves
 from gausim.results.pictures import Pictures, save_pictures
 from gausim.results.summary import write_summary
@@ -120,3 +125,17 @@ def write_sweep(root: Path) -> Path:
     (failed / "FAILED").write_text("Traceback\nRuntimeError: out of memory\n")
     write_run(root / "no_momentum" / "seed_0", config(conserve_momentum=False), finished=False)
     return root
+
+
+def study_of(root: Path) -> Study:
+    return make_study(find_runs([root]))
+
+
+def sheets_of(root: Path) -> dict[str, Sheet]:
+    return {sheet.key: sheet for sheet in make_sheets(study_of(root))}
+
+
+def page_of(root: Path, **options: Any) -> str:
+    """The page of all runs below a folder, written to ``report`` in it."""
+    write_report([root], root / "report", **options)
+    return (root / "report" / "report.html").read_text()

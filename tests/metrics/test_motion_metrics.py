@@ -1,15 +1,20 @@
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
-from gausim.metrics import motion_energy, point_error
+from gausim.metrics import bounce, chamfer, motion_energy, point_error, track_error
+from gausim.metrics.motion import MOST_POINTS
 
 
-def test_point_error_by_hand() -> None:
+def test_point_and_track_error_by_hand() -> None:
     target = torch.zeros(2, 4, 3)
     prediction = target.clone()
-    prediction[1, 0] = torch.tensor([3.0, 0.0, 4.0])  # 5 over four points, diagonal 10: 12.5 %
+    prediction[1, 0] = torch.tensor([3.0, 0.0, 4.0])  # 5 over four points [scene units]; diagonal 10: 12.5 %
+    assert track_error(prediction, target).tolist() == pytest.approx([0.0, 1.25])
     assert point_error(prediction, target, 10.0).tolist() == pytest.approx([0.0, 12.5])
 
 
@@ -18,3 +23,34 @@ def test_motion_energy_of_points_and_images_by_hand() -> None:
     frames[1, 0, 0] = 2.0  # 4 in the first step, and back again
     frames[2, 1, 1] = 1.0
     assert motion_energy(frames).tolist() == motion_energy(frames[:, None]).tolist() == pytest.approx([4.0, 5.0])
+
+
+def test_chamfer_distance_is_one_sided_and_needs_no_order() -> None:
+    line = torch.stack((torch.arange(5.0), torch.zeros(5), torch.zeros(5)), 1)
+    lifted = (line + torch.tensor([0.0, 0.25, 0.0])).flip(0)
+    assert chamfer(lifted[None], line[None]).tolist() == pytest.approx([0.25])
+    # Every true point is hit, the predicted one beside them does not count; the other way round it does.
+    more = torch.cat((line, torch.tensor([[0.0, 6.0, 0.0]])))
+    assert chamfer(more[None], line[None]).tolist() == [0.0]
+    assert chamfer(line[None], more[None]).tolist() == pytest.approx([1.0])
+
+
+def test_chamfer_distance_thins_many_true_points() -> None:
+    target = torch.rand(1, MOST_POINTS + 1, 3, generator=torch.Generator().manual_seed(0))
+    shifted = target + torch.tensor([0.0, 0.0, 7.0])
+    near = torch.cdist(target[0, ::2], shifted[0]).amin(1).mean()
+    assert chamfer(shifted, target).item() == pytest.approx(near.item(), rel=1e-5)
+
+
+def test_bounce_of_a_ball_that_keeps_a_quarter_of_its_height() -> None:
+    """Two points 0.2 below and above a centre that falls from 1 and comes up to 0.4 + 0.15 again."""
+    centre = np.array([1.0, 0.9, 0.6, 0.19, 0.1, 0.2, 0.45, 0.55, 0.5, 0.3])
+    heights = np.stack((centre - 0.2, centre + 0.2), 1)
+    found = bounce(heights, diagonal=1.0)
+    assert (found.height, found.rise, found.depth) == pytest.approx((0.55, 0.45, 0.1))
+
+
+@pytest.mark.parametrize("centre", [[1.0, 0.9, 0.8], [1.0, 0.4, 0.0, 0.0]])
+def test_no_bounce_without_contact_or_rise(centre: list[float]) -> None:
+    found = bounce(np.array(centre)[:, None], diagonal=1.0)
+    assert math.isnan(found.height) and math.isnan(found.rise) and found.depth == 0

@@ -1,15 +1,13 @@
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
 
 import cv2
 import numpy as np
+from helpers.report_runs import make_curves
 
 from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
 from gausim.report.pictures.frames import Timeline, moving_line, space_time_slice, video_frame
-
-CURVES = runpy.run_path(str(Path(__file__).with_name("test_summary.py")))["curves"]
 
 
 def swinging(frames: int = 12, height: int = 20, width: int = 30) -> np.ndarray:
@@ -48,7 +46,7 @@ def test_video_frames_have_one_size_and_mark_what_is_foreseen():
 
 
 def test_error_figure_is_written(tmp_path):
-    error_figure(CURVES(), tmp_path / "new" / "errors.png", sequence="b")
+    error_figure(make_curves(), tmp_path / "new" / "errors.png", sequence="b")
     image = read(tmp_path / "new" / "errors.png")
     assert image.shape[1] > 1200  # three panels: 3D, training views, held-out views
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50

@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import report_runs
-from helpers.report_runs import config, evaluate, make_curves, write_run
+from helpers.report_runs import config, evaluate, make_curves, page_of, study_of, write_run
 
 from gausim.io.video import read_video
-from gausim.report.gather.runs import find_runs
-from gausim.report.gather.study import make_study
 from gausim.report.opening import MOST_OPENINGS, MOST_ROWS, make_openings
 from gausim.report.pictures.frames import SEEN
 from gausim.report.tables.verdict import outcome, sentences
-from gausim.report.write import write_report
+from gausim.results.curves import ImageMetricInfo
 
 EVIL = "<script>alert(1)</script>&\"'|`"
 
@@ -111,7 +108,7 @@ def test_seeds_are_averaged_and_a_fit_that_repeats_is_no_foresight():
 def with_psnr(error: float, name: str = "toy_bunny") -> Any:
     """Curves with a PSNR that goes with their l2, and the second view held out (as their pictures have it)."""
     curves = make_curves(error, name=name)
-    psnr = report_runs.ImageMetricInfo("psnr", "PSNR", 1.0, "dB", True)
+    psnr = ImageMetricInfo("psnr", "PSNR", 1.0, "dB", True)
     for row in ("gausim", "static"):
         curves.values[row]["psnr"] = -10 * np.log10(curves.values[row]["l2"])
     return replace(curves, facts=replace(curves.facts, metrics=(*curves.facts.metrics, psnr)))
@@ -125,8 +122,7 @@ def first_screen(page: str) -> str:
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     root = tmp_path_factory.mktemp("one")
     evaluate(write_run(root / "a", config()), with_psnr(1.0))
-    write_report([root], root / "report")
-    return (root / "report" / "report.html").read_text()
+    return page_of(root)
 
 
 def test_the_first_screen_is_a_video_three_sentences_and_a_small_table(page: str):
@@ -163,15 +159,14 @@ def test_several_rows_are_compared_in_the_one_table_and_runs_can_be_chosen(tmp_p
         settings = config(name=f"run{i}")
         settings["optimizer"]["network_lr"] = 0.1 * (i + 1)
         evaluate(write_run(tmp_path / f"r{i}", settings), with_psnr(3.0 - 0.3 * i))
-    study = make_study(find_runs([tmp_path]))
+    study = study_of(tmp_path)
     openings, left = make_openings(study, pictures=False)
     assert len(openings) == MOST_OPENINGS and left == 2
     assert openings[0].run.name == "r7" and openings[0].label == "gausim (run7)"
     table = openings[0].table
     assert [row[0] for row in table.rows] == [*(f"gausim (run{i})" for i in (7, 6, 5, 4, 3)), "no motion"]
     assert "views never trained on" in table.title and "best 5 of 8" in table.title
-    write_report([tmp_path], tmp_path / "report", pictures=False)
-    page = (tmp_path / "report" / "report.html").read_text()
+    page = page_of(tmp_path, pictures=False)
     assert page.count('type="radio"') == MOST_OPENINGS == page.count('<section class="opening"')
     assert page.count(" checked>") == 1 and "and 2 more:" in page and "<script" not in page
 
@@ -180,14 +175,12 @@ def test_what_is_missing_is_named_with_the_command_that_makes_it(tmp_path: Path)
     trained = write_run(tmp_path / "my run", config())
     failed = write_run(tmp_path / "failed", config(conserve_mass=False), finished=False)
     (failed / "FAILED").write_text("RuntimeError: out of memory")
-    write_report([tmp_path], tmp_path / "report")
-    first = html.unescape(first_screen((tmp_path / "report" / "report.html").read_text()))
+    first = html.unescape(first_screen(page_of(tmp_path)))
     assert "Nothing has been evaluated" in first and f"<code>gausim evaluate '{trained}'</code>" in first
     assert "failed (RuntimeError: out of memory)" in first and "<video" not in first
 
     (evaluate(trained, with_psnr(1.0)) / "evaluation" / "pictures.npz").unlink()
-    write_report([trained], tmp_path / "report")
-    first = html.unescape(first_screen((tmp_path / "report" / "report.html").read_text()))
+    first = html.unescape(first_screen(page_of(trained)))
     assert "There is no video:" in first and f"<code>gausim evaluate {trained}</code>" in first
     assert first.count("<table") == 1
 
@@ -201,7 +194,6 @@ def test_hostile_names_stay_text_on_the_first_screen(tmp_path: Path):
     summary["objects"][name]["heldout_views"] = [EVIL]
     (run / "evaluation" / "metrics.json").write_text(json.dumps(summary))
     write_run(tmp_path / "b", config(name=EVIL, conserve_mass=False), model=EVIL)
-    write_report([tmp_path], tmp_path / "report", title=EVIL)
-    page = (tmp_path / "report" / "report.html").read_text()
+    page = page_of(tmp_path, title=EVIL)
     assert "<script" not in page and first_screen(page).count("&lt;script&gt;") >= 4 and "<video" in page
     assert "<script>" not in (tmp_path / "report" / "results.md").read_text().replace("\\<script\\>", "")

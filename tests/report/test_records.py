@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, page_of, study_of, write_run
 
 from gausim.cli import main as cli
 from gausim.core import RunError
@@ -29,36 +29,38 @@ from gausim.report.records.record import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
+HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
+# Commands of LaTeX itself and of the packages that the file's first line asks for.
+KNOWN = {
+    "begin", "end", "centering", "caption", "label", "textbf", "linewidth", "width", "ifdim", "else", "fi", "pm",
+    "times", "to", "uparrow", "downarrow", "sigma", "div",  # LaTeX
+    "textbackslash", "textasciitilde", "textasciicircum", "textless", "textgreater", "textbar", "textquotedbl",  # T1
+    "toprule", "midrule", "bottomrule", "resizebox",  # booktabs, graphicx
+}  # fmt: skip
 
 
-@pytest.fixture
-def sweep(tmp_path: Path) -> Path:
-    return report_runs.write_sweep(tmp_path / "sweep")
+def record_of(root: Path) -> Record:
+    return measured_record(study_of(root), "Sweep")
 
 
 def test_a_record_holds_every_figure_with_seeds_and_sequences_apart(sweep: Path, tmp_path: Path) -> None:
-    record = measured_record(make_study(find_runs([sweep])), "Sweep")
+    record = record_of(sweep)
     keys = [table.key for table in record.tables]
     assert keys[0] == "toy_bunny_comparison" and {"toy_bunny_seen_train", "toy_bunny_unseen_points"} < set(keys)
     first = record.tables[0]
-    heads = [column.label for column in first.columns]
-    assert heads == [
+    assert [column.label for column in first.columns] == [
         "l2 [1e-3]", "SSIM [1e-1]", "3D ÷ static", "motion energy", "units", "fit [CPU min]", "fit, memory [GB]",
         "per frame [s]", "prediction, memory [MB]",
     ]  # fmt: skip
     rows = {row.label[0]: row for row in first.rows}
     assert list(rows) == ["gausim", "gausim w/o mass", "static"]
-    l2 = rows["gausim"].cells[0]
-    assert isinstance(l2, Figure) and l2.seeds == [10.0, 12.0] and l2.mean == 11.0
-    assert l2.seed_std == pytest.approx(2**0.5, rel=1e-5) and l2.std == pytest.approx(5.52268, rel=1e-5)
-    one = rows["gausim w/o mass"].cells[0]
-    assert isinstance(one, Figure) and one.seeds == [] and one.seed_std is None and one.std == 7.5
-    ratio = rows["gausim"].cells[2]
-    assert isinstance(ratio, Figure) and ratio.mean == pytest.approx(1.1 / 4) and ratio.std is not None
-    fit, memory = rows["gausim"].cells[5], rows["gausim"].cells[8]
-    assert isinstance(fit, Figure) and fit.mean == pytest.approx(1.1) and rows["static"].cells[5] is None
-    assert isinstance(memory, Figure) and memory.mean == pytest.approx(3.3)
-    assert rows["gausim"].cells[4] == "200 → 20 → 4"
+    l2, _, ratio, _, units, fit, _, _, memory = rows["gausim"].cells
+    spreads = (pytest.approx(2**0.5, rel=1e-5), pytest.approx(5.52268, rel=1e-5))
+    assert l2 == Figure(11.0, [10.0, 12.0], *spreads)
+    assert rows["gausim w/o mass"].cells[0] == Figure(15.0, std=7.5)
+    assert ratio.mean == pytest.approx(1.1 / 4) and ratio.std is not None
+    assert fit.mean == pytest.approx(1.1) and rows["static"].cells[5] is None
+    assert memory.mean == pytest.approx(3.3) and units == "200 → 20 → 4"
     assert record.made.missing == ["no_hierarchy/seed_0 (failed)", "no_momentum/seed_0 (unfinished)"]
     assert record.made.commits == ["c0ffeec0ffee"] and record.made.hardware == ["not recorded"]
     save_record(tmp_path / "record.json", record)
@@ -66,11 +68,11 @@ def test_a_record_holds_every_figure_with_seeds_and_sequences_apart(sweep: Path,
 
 
 def test_the_size_of_an_ablation_is_told_against_the_spread_of_seeds(sweep: Path) -> None:
-    report_runs.evaluate(
-        report_runs.write_run(sweep / "no_mass" / "seed_1", report_runs.config(1, conserve_mass=False)),
-        report_runs.make_curves(1.7),
+    evaluate(
+        write_run(sweep / "no_mass" / "seed_1", config(1, conserve_mass=False)),
+        make_curves(1.7),
     )
-    table = measured_record(make_study(find_runs([sweep])), "Sweep").table("toy_bunny_ablations_gausim")
+    table = record_of(sweep).table("toy_bunny_ablations_gausim")
     full, without = table.rows
     assert (full.label, without.label) == (["full"], ["w/o mass"]) and full.cells[-2:] == [None, None]
     # Means 11 and 16, deviations over two seeds the square root of 2 each: a difference of 5 in units of that.
@@ -92,7 +94,7 @@ def test_a_metric_that_is_new_is_a_column(sweep: Path) -> None:
 
 
 def test_errors_by_frames_ahead_are_a_table(sweep: Path) -> None:
-    table = measured_record(make_study(find_runs([sweep])), "Sweep").table("toy_bunny_ahead")
+    table = record_of(sweep).table("toy_bunny_ahead")
     assert [column.label for column in table.columns] == ["+1", "+2", "+5", "+10", "+20", "+30"]
     rows = {row.label[0]: row.cells[0] for row in table.rows}
     # l2 of 1e-3 and 3e-3, five times that in unseen frames, of the two seeds 1 and 1.2 times that.
@@ -101,12 +103,10 @@ def test_errors_by_frames_ahead_are_a_table(sweep: Path) -> None:
 
 
 def test_several_objects_have_a_summary(sweep: Path) -> None:
-    assert all(table.key != "summary" for table in measured_record(make_study(find_runs([sweep])), "Sweep").tables)
-    run = report_runs.write_run(
-        sweep / "other", report_runs.config() | {"data": {"root": "/data/toy", "names": ["toy_cube"], "seed": 0}}
-    )
-    report_runs.evaluate(run, report_runs.make_curves(2.0, name="toy_cube"))
-    table = measured_record(make_study(find_runs([sweep])), "Sweep").tables[0]
+    assert all(table.key != "summary" for table in record_of(sweep).tables)
+    run = write_run(sweep / "other", config() | {"data": {"root": "/data/toy", "names": ["toy_cube"], "seed": 0}})
+    evaluate(run, make_curves(2.0, name="toy_cube"))
+    table = record_of(sweep).tables[0]
     names = ("toy_bunny", "toy_cube")
     assert table.key == "summary" and [column.label for column in table.columns] == [
         f"{name}: {what}" for name in names for what in ("l2 [1e-3]", "3D ÷ static")
@@ -118,12 +118,19 @@ def test_several_objects_have_a_summary(sweep: Path) -> None:
 def test_runs_that_take_over_from_runs_of_other_seeds_or_objects_are_one_row(tmp_path: Path) -> None:
     for name, error in (("toy_bunny", 1.0), ("toy_cube", 2.0)):
         for seed in (0, 1):
-            own = report_runs.config(seed) | {"data": {"root": "/data/toy", "names": [name], "seed": seed}}
+            own = config(seed) | {"data": {"root": "/data/toy", "names": [name], "seed": seed}}
             own |= {"model": {"method": {"_target_": "physgaussian"}}, "init_from": f"out/{name}/seed_{seed}"}
-            run = report_runs.write_run(tmp_path / name / f"seed_{seed}", own, model="physgaussian")
-            report_runs.evaluate(run, report_runs.make_curves(error + seed, name=name))
-    table = measured_record(make_study(find_runs([tmp_path])), "Taken over").table("summary")
+            run = write_run(tmp_path / name / f"seed_{seed}", own, model="physgaussian")
+            evaluate(run, make_curves(error + seed, name=name))
+    table = record_of(tmp_path).table("summary")
     assert [(row.label, row.cells[::2]) for row in table.rows] == [(["physgaussian"], [15.0, 25.0])]
+
+
+def test_an_object_that_no_run_has_evaluated_has_no_tables(sweep: Path) -> None:
+    other = config() | {"data": {"root": "/data/other", "names": ["toy_cube"], "seed": 0}}
+    write_run(sweep / "other", other)
+    assert study_of(sweep).objects == ("toy_bunny", "toy_cube")
+    assert all(table.key.startswith("toy_bunny") for table in record_of(sweep).tables)
 
 
 def test_rows_of_different_sequences_are_told_apart(sweep: Path) -> None:
@@ -160,7 +167,7 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     assert (
         latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == len(load_record(out / "sweep.json").tables)
     )
-    assert f"% Command: {command}" in latex and r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
+    assert f"% Command: {command}" in latex
     assert cli.main(["report", str(sweep / "no_hierarchy"), "--results", str(out)]) == 2
     assert "no run here is evaluated" in capsys.readouterr().err
     assert cli.main(["report", "--results", str(out)]) == 2
@@ -254,6 +261,56 @@ def test_whole_pages_of_one_record() -> None:
     made.made.test = "Looked at once."
     assert "# Title\n\nLooked at once.\n\n* Recorded: 2026-01-01" in results_page(made)
     assert "Looked at once." in results_latex(made)
+
+
+# ------------------------------------------------------------ LaTeX, by its text: no LaTeX is needed to run this
+
+
+def check(text: str) -> None:
+    """What TeX would refuse: unknown commands, groups and environments that do not nest, specials as text."""
+    body = re.sub(r"(?m)(?<!\\)%.*$", "", text)
+    assert set(re.findall(r"\\([A-Za-z]+)", re.sub(r"\\\\", "", body))) <= KNOWN
+    bare = re.sub(r"\\[&%$#_{}\\]", "", body)  # without what is escaped
+    depth, environments = 0, []
+    for brace, kind, name in re.findall(r"([{}])|\\(begin|end)(?=\{(\w+))", bare):
+        depth += {"{": 1, "}": -1}.get(brace, 0)
+        assert depth >= 0
+        if kind == "begin":
+            environments.append(name)
+        elif kind:
+            assert environments.pop() == name
+    assert depth == 0 and environments == []
+    assert not set("$^_#~%") & set(re.sub(r"\$[^$\n]*\$", "", bare))
+    assert "&" not in re.sub(r"\\begin\{tabular\}.*?\\end\{tabular\}", "", bare, flags=re.S)
+
+
+@pytest.fixture
+def latex(sweep: Path) -> str:
+    evaluate(write_run(sweep / "other", config(name=HOSTILE), model=None), make_curves(2.0, name=HOSTILE))
+    page_of(sweep, pictures=False)
+    return (sweep / "report" / "tables.tex").read_text()
+
+
+def test_everything_nests_and_is_escaped(latex: str) -> None:
+    check(latex)
+    assert "etc/passwd" in latex  # the hostile name is there, as text
+    assert not [c for c in re.sub(r"(?m)(?<!\\)%.*$", "", latex) if ord(c) > 126]
+
+
+def test_rows_fill_their_columns_between_rules_of_booktabs(latex: str) -> None:
+    tables = re.findall(r"\\begin\{tabular\}\{(lc+)\}\n(.*?)\\end\{tabular\}", latex, re.S)
+    assert len(tables) == latex.count(r"\begin{table*}") == latex.count(r"\caption{") > 6
+    for columns, table in tables:
+        assert re.findall(r"^\\(top|mid|bottom)rule$", table, re.M) == ["top", "mid", "bottom"]
+        rows = [line for line in table.splitlines() if not line.endswith("rule")]
+        assert all(row.endswith(r" \\") and len(re.split(r"(?<!\\)&", row)) == len(columns) for row in rows)
+    labels = re.findall(r"\\label\{(.*?)\}", latex)
+    assert len(set(labels)) == len(labels) and all(re.fullmatch(r"tab:[A-Za-z0-9-]+", label) for label in labels)
+    assert (
+        r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
+        and "% Without figures: no_hierarchy/seed_0 (failed)" in latex
+    )
+    assert all(package in latex.splitlines()[0] for package in ("booktabs", "graphicx", "T1"))
 
 
 # ---------------------------------------------------------------------------------------- the repository's own figures

@@ -33,16 +33,19 @@ def curves(**changes) -> ObjectCurves:
 
 
 @pytest.mark.parametrize(
-    ("frames", "expected"),
+    ("frames", "first_unseen", "expected"),
     [
-        (60, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26), "unseen_all": (16, 60)}),
-        (50, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26)}),
-        (20, {"seen": (0, 16), "unseen": (16, 20), "unseen_near": (16, 20)}),
-        (16, {"seen": (0, 16)}),
+        (60, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26), "unseen_all": (16, 60)}),
+        (50, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26)}),
+        (20, 16, {"seen": (0, 16), "unseen": (16, 20), "unseen_near": (16, 20)}),
+        (16, 16, {"seen": (0, 16)}),
+        # The last third of a recording is one range.
+        (60, 42, {"seen": (0, 42), "unseen": (42, 60), "unseen_near": (42, 52)}),
+        (90, 63, {"seen": (0, 63), "unseen": (63, 90), "unseen_near": (63, 73)}),
     ],
 )
-def test_splits(frames, expected):
-    assert frame_splits(frames, 16) == expected
+def test_splits(frames, first_unseen, expected):
+    assert frame_splits(frames, first_unseen) == expected
 
 
 def test_cells_by_hand():
@@ -57,11 +60,12 @@ def test_cells_by_hand():
 
 
 def test_energy_is_pooled_over_sequences_and_means_are_their_own():
-    cell = summarise(curves())["rows"]["ours"]["unseen"]["points"]["motion_energy"]
-    assert cell["mean"] == pytest.approx(0.75) and cell["std"] == pytest.approx(0.25)
-    assert cell["pooled"] == pytest.approx((0.5 * 1 + 1.0 * 9) / 10)
-    assert cell["ratio"] is None
-    assert summarise(curves())["rows"]["ours"]["seen"]["train"]["motion_energy"]["pooled"] == pytest.approx(0.5)
+    ours = summarise(curves())["rows"]["ours"]
+    pooled = pytest.approx((0.5 * 1 + 1.0 * 9) / 10)
+    assert ours["unseen"]["points"]["motion_energy"] == {
+        "mean": pytest.approx(0.75), "std": pytest.approx(0.25), "ratio": None, "pooled": pooled
+    }  # fmt: skip
+    assert ours["seen"]["train"]["motion_energy"]["pooled"] == pytest.approx(0.5)
 
 
 def test_the_step_into_the_first_unseen_frame_counts_as_unseen():

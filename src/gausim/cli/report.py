@@ -26,8 +26,7 @@ def main(argv: list[str]) -> int:
     if arguments.results or arguments.record:
         return _write_results(arguments)
     from gausim.cli.end import end
-    from gausim.report.render import summary_line
-    from gausim.report.write import write_report
+    from gausim.report.write import summary_line, write_report
 
     out = arguments.out or arguments.dirs[0] / "report"
     report = write_report(

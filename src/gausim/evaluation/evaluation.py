@@ -7,6 +7,7 @@ kept.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,9 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from gausim import metrics
 from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
 from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, Trajectory
 from gausim.data.images import composite
@@ -24,21 +26,6 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.evaluation.recorder import PictureRecorder
 from gausim.evaluation.references import Bounces, Reference
-from gausim.metrics import (
-    FLIP,
-    L2,
-    LPIPS,
-    PSNR,
-    SSIM,
-    ForegroundL2,
-    ForegroundPSNR,
-    ImageMetric,
-    chamfer,
-    mask_iou,
-    motion_energy,
-    point_error,
-    track_error,
-)
 from gausim.metrics.image import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
@@ -77,19 +64,21 @@ MASK_IOU = ImageMetricInfo(IOU, "mask IoU", 1.0, "", higher_is_better=True)
 PIXELS_AT_ONCE = 1 << 20
 
 
-def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
+def default_metrics(side: int = SMALLEST) -> list[metrics.ImageMetric]:
     """The image metrics of tables for images of ``side`` pixels, with FLIP and LPIPS where they are available."""
     absent = absent_metrics(side)
-    optional = [metric() for metric in (FLIP, LPIPS) if metric.key not in absent]
-    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), *optional]
+    optional = [kind() for kind in (metrics.FLIP, metrics.LPIPS) if kind.key not in absent]
+    basic = (metrics.L2, metrics.ForegroundL2, metrics.PSNR, metrics.ForegroundPSNR, metrics.SSIM)
+    return [*(kind() for kind in basic), *optional]
 
 
 def absent_metrics(side: int) -> dict[str, str]:
     """Reasons by key why FLIP or LPIPS cannot be computed on images of ``side`` pixels."""
-    absent = {} if flip_is_installed() else {FLIP.key: NO_PACKAGE}
-    if side < SMALLEST:
-        return absent | {LPIPS.key: TOO_SMALL}
-    return absent if weights_path().is_file() else absent | {LPIPS.key: NO_WEIGHTS}
+    reasons = {
+        metrics.FLIP.key: "" if flip_is_installed() else NO_PACKAGE,
+        metrics.LPIPS.key: TOO_SMALL if side < SMALLEST else "" if weights_path().is_file() else NO_WEIGHTS,
+    }
+    return {key: reason for key, reason in reasons.items() if reason}
 
 
 def evaluate_object(
@@ -111,15 +100,14 @@ def evaluate_object(
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
-    measure = _ObjectMeasure(data, scene, renderer, views)
+    measure = _ObjectMeasure(data, scene, methods, renderer, views)
     records = _chosen(data, sequences)
-    references = _linear_references(data) if measure.reference.name == STATIC else {}
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
         # A separate record, so that its decoded frames are freed with it.
         fresh = data.record(record.name)
-        results.append(measure.sequence(fresh, methods, references, pictures if record is records[0] else None))
+        results.append(measure.sequence(fresh, pictures if record is records[0] else None))
         if advance is not None:
             advance(record.name)
     facts = ObjectFacts(
@@ -139,7 +127,7 @@ def evaluate_object(
         max_l2=measure.max_l2,
         reference=measure.reference.name,
     )
-    return ObjectCurves(facts, _stack(results), measure.record(methods), pictures.finish())
+    return ObjectCurves(facts, _stack(results), measure.record(), pictures.finish())
 
 
 def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
@@ -173,8 +161,15 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
 class _ObjectMeasure:
     """Figures of one object's sequences, with the quantities over all of them (mean colour, largest l2, costs)."""
 
-    def __init__(self, data: ObjectData, scene: GaussianScene, renderer: Renderer, views: Sequence[str] | None) -> None:
-        self.data, self.scene, self.renderer = data, scene, renderer
+    def __init__(
+        self,
+        data: ObjectData,
+        scene: GaussianScene,
+        methods: Mapping[str, Predict],
+        renderer: Renderer,
+        views: Sequence[str] | None,
+    ) -> None:
+        self.data, self.scene, self.methods, self.renderer = data, scene, methods, renderer
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
         self.metrics, self._absent = default_metrics(side), absent_metrics(side)
@@ -184,20 +179,26 @@ class _ObjectMeasure:
         self.attached = None if points is None else attach_points(scene, points)
         self.max_l2 = 0.0
         self._color = torch.zeros(4, dtype=torch.float64)
-        self._costs: dict[str, CostMeter] = {}
+        self._linear = _linear_references(data) if self.reference.name == STATIC else {}
+        self._costs = {name: CostMeter() for name in methods}
         self._diagnosis = Diagnosis(data.fps)
 
-    def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """Summary entries besides the figures: costs of every method, hashes of the data, absent metrics, diagnosis."""
-        costs = {
-            name: {**meter.summary(), "levels": getattr(methods[name], "levels", None)}
-            for name, meter in self._costs.items()
+        levels, footnotes = self._told("levels"), self._told("footnotes")
+        facts = {
+            "efficiency": {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()},
+            "sources": data_provenance(self.data),
+            "absent": self._absent,
+            "footnotes": {name: found for name, found in footnotes.items() if found is not None},
+            "diagnosis": self._diagnosis.summary(),
+            "bounce": self._bounces.summary(),
         }
-        footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
-        sources = data_provenance(self.data)
-        facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}
-        further = {"diagnosis": self._diagnosis.summary(), "bounce": self._bounces.summary()}
-        return {**facts, **{key: found for key, found in further.items() if found is not None}}
+        return {key: found for key, found in facts.items() if found is not None}
+
+    def _told(self, attribute: str) -> dict[str, Any]:
+        """An optional attribute of every method, None where it has none."""
+        return {name: getattr(predict, attribute, None) for name, predict in self.methods.items()}
 
     @property
     def mean_color(self) -> tuple[float, float, float]:
@@ -206,25 +207,17 @@ class _ObjectMeasure:
         return r, g, b
 
     @torch.no_grad()
-    def sequence(
-        self,
-        record: SequenceRecord,
-        methods: Mapping[str, Predict],
-        references: Mapping[str, LinearAR2],
-        pictures: PictureRecorder | None = None,
-    ) -> Rows:
+    def sequence(self, record: SequenceRecord, pictures: PictureRecorder | None = None) -> Rows:
         """Figures of one sequence, (F, V) and (F,) per row and metric; adds the frames to ``pictures``."""
         trajectories = {}
-        for name, predict in methods.items():
-            meter = self._costs.setdefault(name, CostMeter())
-            made = meter.predict(partial(predict, record), record.count - 1)
+        for name, predict in self.methods.items():
+            made = self._costs[name].predict(partial(predict, record), record.count - 1)
             trajectories[name] = self._checked(name, record, made)
         truth = self.data.ground_truth(record)
         reference = self.reference.trajectory(record, truth)
         rows = self._images(record, trajectories, reference, pictures)
         if truth is not None:
-            units = {name: found for name, predict in methods.items() if (found := getattr(predict, "units", None))}
-            self._points(rows, {**trajectories, self.reference.name: reference}, references, truth, units)
+            self._points(rows, {**trajectories, self.reference.name: reference}, truth)
         return rows
 
     def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
@@ -248,14 +241,15 @@ class _ObjectMeasure:
     ) -> Rows:
         cameras = record.cameras_of(self.views).to(self.scene.means.device)
         first = self._draw(reference, range(1), cameras)
-        parts: dict[str, dict[str, list[Tensor]]] = {}
+        parts: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
         before: dict[str, Tensor] = {}
         for frames in _chunks(record, len(self.views)):
             recorded = record.frames(frames, self.views)
             target, alpha = composite(recorded)
             target, alpha = target.to(first.rgb), alpha.to(first.alpha)
             mask = alpha > 0
-            self._count_color(target, mask)
+            total = target[mask].sum(0, dtype=torch.float64)
+            self._color += torch.cat((total, mask.sum()[None].double())).cpu()
             images_of = {
                 name: self._costs[name].draw(partial(self._draw, t, frames, cameras), mask.shape[:2].numel())
                 for name, t in trajectories.items()
@@ -267,18 +261,15 @@ class _ObjectMeasure:
             else:
                 beside = self._draw(reference, frames, cameras)
             every = {**images_of, self.reference.name: beside}
-            for name, shown in every.items():
-                parts.setdefault(name, {}).setdefault(IOU, []).append(mask_iou(shown.alpha, alpha))
             drawn = {name: shown.rgb for name, shown in every.items()}
-            for i, (name, images) in enumerate(drawn.items()):
-                if i == 0:
-                    self.max_l2 = max(self.max_l2, float((images - target).norm(dim=-1).max()))
+            self.max_l2 = max(self.max_l2, float((next(iter(drawn.values())) - target).norm(dim=-1).max()))
+            for name, shown in every.items():
+                parts[name][IOU].append(metrics.mask_iou(shown.alpha, alpha))
                 for metric in self.metrics:
-                    flat = (x.flatten(0, 1) for x in (images, target, mask))
-                    values = metric.per_image(*flat).reshape(mask.shape[:2])
-                    parts.setdefault(name, {}).setdefault(metric.key, []).append(values)
+                    flat = (x.flatten(0, 1) for x in (shown.rgb, target, mask))
+                    parts[name][metric.key].append(metric.per_image(*flat).reshape(mask.shape[:2]))
             for name, images in {**drawn, TRUTH: target}.items():
-                parts.setdefault(name, {}).setdefault(IMAGE_ENERGY, []).append(_energy(images, before.get(name)))
+                parts[name][IMAGE_ENERGY].append(_energy(images, before.get(name)))
                 before[name] = images[-1:]
         return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
 
@@ -289,18 +280,7 @@ class _ObjectMeasure:
         images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
         return Rendered(images.rgb.clamp(0, 1), images.alpha)
 
-    def _count_color(self, target: Float[Tensor, "F V H W 3"], mask: Bool[Tensor, "F V H W"]) -> None:
-        total = target[mask].sum(0, dtype=torch.float64)
-        self._color += torch.cat((total, mask.sum()[None].double())).cpu()
-
-    def _points(
-        self,
-        rows: Rows,
-        trajectories: Mapping[str, Trajectory],
-        references: Mapping[str, LinearAR2],
-        truth: GroundTruth,
-        units: Mapping[str, Sequence[Tensor]],
-    ) -> None:
+    def _points(self, rows: Rows, trajectories: Mapping[str, Trajectory], truth: GroundTruth) -> None:
         """Adds 3D errors and energies to the rows."""
         assert self.attached is not None
         frames = len(truth.positions)
@@ -309,10 +289,11 @@ class _ObjectMeasure:
             for name, t in trajectories.items()
         }
         displacement = truth.positions - truth.rest
-        for name, linear in references.items():
+        for name, linear in self._linear.items():
             predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
         moving = {name: points for name, points in predicted.items() if name != self.reference.name}
-        parts = {name: [unit[self.attached] for unit in levels] for name, levels in units.items()}
+        levels = {name: found for name, found in self._told("units").items() if found}
+        parts = {name: [unit[self.attached] for unit in units] for name, units in levels.items()}
         self._diagnosis.add(truth.positions, truth.rest, moving, parts)
         spread = truth.rest.amax(0) - truth.rest.amin(0)
         diagonal = self.data.diagonal or float(spread.norm())
@@ -320,10 +301,10 @@ class _ObjectMeasure:
         for name, points in {**predicted, TRUTH: truth.positions}.items():
             row = rows.setdefault(name, {})
             if name != TRUTH:
-                row[ERROR_3D] = point_error(points, truth.positions, diagonal).cpu().numpy()
-                row[TRACK_ERROR] = track_error(points, truth.positions).cpu().numpy()
-                row[CHAMFER] = chamfer(points, truth.positions).numpy()
-            row[POINT_ENERGY] = np.concatenate(([np.nan], motion_energy(points).cpu().numpy()))
+                row[ERROR_3D] = metrics.point_error(points, truth.positions, diagonal).cpu().numpy()
+                row[TRACK_ERROR] = metrics.track_error(points, truth.positions).cpu().numpy()
+                row[CHAMFER] = metrics.chamfer(points, truth.positions).numpy()
+            row[POINT_ENERGY] = np.concatenate(([np.nan], metrics.motion_energy(points).cpu().numpy()))
 
 
 def _chunks(record: SequenceRecord, views: int) -> Iterator[range]:

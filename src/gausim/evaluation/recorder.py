@@ -35,7 +35,8 @@ class PictureRecorder:
         self._columns = [list(views).index(v) for v in self._views]
         self._truth: list[np.ndarray] = []
         self._drawn: dict[str, list[np.ndarray]] = {}
-        self._behind: tuple[Tensor, Tensor] | None = None
+        # Sum of the colours of every pixel in frames where it is background, and the number of these.
+        self._total, self._count = torch.zeros(()), torch.zeros(())
 
     def add(self, recorded: UInt8[Tensor, "F V H W 4"], drawn: Mapping[str, Rendered]) -> None:
         """Adds the next frames: recorded ones (straight alpha), and the rendered ones of every method."""
@@ -45,8 +46,7 @@ class PictureRecorder:
             rgb, alpha = (x[:, self._columns] for x in (images.rgb, images.alpha))
             self._drawn.setdefault(name, []).append(_small(rgb, alpha))
         free = (straight[..., 3:] == 0).float()
-        total, count = (straight[..., :3] * free).sum(0), free.sum(0)
-        self._behind = (total, count) if self._behind is None else (self._behind[0] + total, self._behind[1] + count)
+        self._total, self._count = self._total + (straight[..., :3] * free).sum(0), self._count + free.sum(0)
 
     def finish(self) -> Pictures:
         """The pictures of all frames added."""
@@ -67,8 +67,7 @@ class PictureRecorder:
 
         Pixels that are never background get the mean of the others.
         """
-        assert self._behind is not None
-        total, count = self._behind
+        total, count = self._total, self._count
         if float(total.max()) == 0.0:
             return None
         overall = total.sum((1, 2), keepdim=True) / count.sum((1, 2), keepdim=True).clamp_min(1)

@@ -36,7 +36,6 @@ class ImageMetric(Metric, ABC):
     unit: ClassVar[str] = ""  # of the scaled value
     foreground: ClassVar[bool] = False  # whether only the foreground of the true image counts
     higher_is_better = False
-    is_differentiable = True
     full_state_update = False
 
     total: Tensor
@@ -139,7 +138,7 @@ class FLIP(ImageMetric):
         ConfigError: the package is not installed.
     """
 
-    key, label, scale, unit, is_differentiable = "flip", "FLIP", 1e2, "1e-2", False
+    key, label, scale, unit = "flip", "FLIP", 1e2, "1e-2"
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,15 +1,20 @@
-"""Metrics of 3D motion: distance of points to the truth, by level of a hierarchy too, and motion energy."""
+"""Metrics of 3D motion: distance of points to the truth, by level too, motion energy, and the bounce of a fall."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 # True points of the Chamfer distance per frame; of more, every n-th.
 MOST_POINTS = 2000
+# Height of the lowest point of a body at which it touches the floor [diagonals].
+TOUCH = 0.01
 
 
 def point_error(
@@ -66,3 +71,26 @@ def level_error(
         return (total / count).norm(dim=-1).mean(-1)
 
     return size(prediction - target), size(rest - target)
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """First bounce of a falling body [scene units]; NaN where it never lands, or has not risen again."""
+
+    height: float  # highest point of the centre after the first contact, above the floor
+    rise: float  # the same above the lowest point that the centre reached before
+    depth: float  # deepest point of all below the floor, 0 if there is none
+
+
+def bounce(heights: Float[NDArray[np.floating], "F P"], diagonal: float) -> Bounce:
+    """The first bounce of points from their heights above the floor in every frame, and the diagonal [scene units]."""
+    lowest, centre = heights.min(1), heights.mean(1)
+    depth = max(0.0, -float(lowest.min()))
+    landed = np.flatnonzero(lowest < TOUCH * diagonal)
+    after = centre[landed[0] :] if len(landed) else centre[:0]
+    rising = np.flatnonzero(np.diff(after) > 0)
+    if not len(rising):
+        return Bounce(np.nan, np.nan, depth)
+    bottom = float(after[rising[0]])
+    top = float(after[rising[0] :].max())
+    return Bounce(top, top - bottom, depth)

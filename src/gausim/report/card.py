@@ -9,8 +9,8 @@ from typing import Any
 import yaml
 from jinja2 import Environment, PackageLoader
 
-from gausim.report.gather.runs import RunRecord, dig
-from gausim.results.summary import MOTION_ENERGY
+from gausim.report.gather.runs import RunRecord
+from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import (
     GROUP_TITLES,
     LEGEND,
@@ -25,6 +25,7 @@ from gausim.results.table import (
 CARD = "README.md"
 TAGS = ("gaussian-splatting", "neural-simulation", "elastic-dynamics", "3d")
 _LICENCES = ("licence", "license")
+_SOURCES = ("scene", "masks", "manifest")  # files of an object's data whose hashes are told
 # Figure of each group in the front matter and in the limitations.
 _HEADLINES = {"points": "error_3d", "heldout": "l2", "train": "l2"}
 
@@ -53,8 +54,10 @@ def card(run: RunRecord, facts: CardFacts) -> str:
     objects = run.objects
     data, trainer = run.config.get("data", {}), run.config.get("trainer", {})
     costs = {name: dig(entry, "efficiency", _method(entry)) for name, entry in objects.items()}
-    first = next(iter(objects.values()), None)
-    fit = None if first is None else footnotes_of(first, _method(first)).get("fit")
+    first: dict[str, Any] = next(iter(objects.values()), {"methods": []})
+    fit = footnotes_of(first, _method(first)).get("fit")
+    sources = {name: [dig(entry, "sources", key) for key in _SOURCES] for name, entry in objects.items()}
+    hashes = {name: [file for file in files if dig(file, "sha256")] for name, files in sources.items()}
     return environment.get_template("card.md").render(
         run=run,
         facts=facts,
@@ -64,7 +67,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
         levels={name: found for name, cost in costs.items() if (found := dig(cost, "levels"))},
         costs=costs,
         licence_of=lambda name: _data_licence(facts, name),
-        hashes={name: found for name, entry in objects.items() if (found := _hashed(entry))},
+        hashes={name: files for name, files in hashes.items() if files},
         legend=LEGEND,
         tables=lambda name, entry: [markdown_table(table) for table in object_tables(name, entry)],
         asked=[f"{key} {trainer[key]}" for key in ("accelerator", "devices", "threads", "precision") if key in trainer],
@@ -80,12 +83,6 @@ def _data_licence(facts: CardFacts, name: str) -> str:
         return "unknown"
     found = (facts.data.get(name, {}).get(key) for key in _LICENCES)
     return next((one for one in found if isinstance(one, str)), "missing (field `licence` of `dataset.json`)")
-
-
-def _hashed(entry: dict[str, Any]) -> list[dict[str, Any]]:
-    """The files of an object's data whose hashes are known."""
-    found = [dig(entry, "sources", key) for key in ("scene", "masks", "manifest")]
-    return [file for file in found if dig(file, "sha256")]
 
 
 def _front_matter(run: RunRecord, facts: CardFacts) -> str:

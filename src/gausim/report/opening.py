@@ -11,13 +11,13 @@ from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
+from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
 from gausim.report.gather.study import Group, Study, cell, pooled
-from gausim.report.pictures.film import Film, make_film
+from gausim.report.pictures.media import Film, make_film
 from gausim.report.tables.sheets import NOTHING
 from gausim.report.tables.verdict import NAMES, outcome, sentences
 from gausim.results.curves import ERROR_3D, STATIC
-from gausim.results.summary import MOTION_ENERGY
+from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import Table, plus_minus, reference_row
 
 # Largest number of first screens, because videos make up most of a page's size.
@@ -64,12 +64,12 @@ def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening]
 
 def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
     """The evaluated runs of an object, sorted by error, with the best seed of every row first."""
-    found: list[tuple[int, float, Group, RunRecord]] = []
+    found = []
     for group in study.groups:
         seeds = [(outcome([entry], group.method).merit, run) for run, entry in group.entries(name)]
-        ranks = enumerate(sorted(seeds, key=lambda seed: seed[0]))
-        found += [(place, merit, group, run) for place, (merit, run) in ranks]
-    return [(name, group, run) for _, _, group, run in sorted(found, key=lambda item: item[:2])]
+        for place, (merit, run) in enumerate(sorted(seeds, key=lambda seed: seed[0])):
+            found.append(((place, merit), (name, group, run)))
+    return [shown for _, shown in sorted(found, key=lambda item: item[0])]
 
 
 def unanswered(study: Study) -> list[str]:
@@ -91,8 +91,7 @@ def unanswered(study: Study) -> list[str]:
 def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
     entries = [entry for _, entry in group.entries(name)]
     seed = f"seed {run.seed}" if len(entries) > 1 else ""
-    parts = [name] if len(study.objects) > 1 else []
-    parts += [group.label] if len(study.groups) > 1 else []
+    parts = (name if len(study.objects) > 1 else "", group.label if len(study.groups) > 1 else "", seed)
     film, problem = None, "Videos were left out (--no-pictures)."
     if pictures:
         try:
@@ -100,7 +99,7 @@ def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures:
         except RunError as error:
             problem = f"There is no video: {error}"
     return Opening(
-        label=" · ".join([*parts, seed] if seed else parts) or name,
+        label=" · ".join(filter(None, parts)) or name,
         name=name,
         title=f"{name}, predicted by {group.label}",
         row=group.label,
@@ -123,11 +122,9 @@ def first_table(study: Study, group: Group, name: str) -> Table:
 
 def _own_table(study: Study, group: Group, name: str) -> Table:
     splits = study.splits(name)
-    rows = []
-    for split in ("seen", "unseen"):
-        rows += _rows(group, name, split, f"{split} {_span(splits[split])}") if split in splits else []
-    last = "unseen" if "unseen" in splits else "seen"
-    reference = _reference(group, name)
+    known = [split for split in ("seen", "unseen") if split in splits]
+    rows = [row for split in known for row in _rows(group, name, split, f"{split} {_span(splits[split])}")]
+    last, reference = "unseen" if "unseen" in known else "seen", _reference(group, name)
     rows += _rows(group, name, last, NAMES[reference], row=reference)
     seeds = "± standard deviation over seeds. " if len(group.entries(name)) > 1 else ""
     caption = (
@@ -141,9 +138,11 @@ def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
     splits = study.splits(name)
     split = "unseen" if "unseen" in splits else "seen"
 
-    entries = {g.label: [entry for _, entry in g.entries(name)] for g in rivals}
-    merits = {g.label: outcome(entries[g.label], g.method).merit if entries[g.label] else math.inf for g in rivals}
-    ordered = sorted(rivals, key=lambda g: merits[g.label])
+    def merit(rival: Group) -> float:
+        entries = [entry for _, entry in rival.entries(name)]
+        return outcome(entries, rival.method).merit if entries else math.inf
+
+    ordered = sorted(rivals, key=merit)
     shown = ordered[: MOST_ROWS - 1]
     views = "heldout" if any(_rows(g, name, split, "")[1:] for g in shown) else "train"
     rows = [_row(g, name, split, views, g.label) for g in shown]
@@ -167,12 +166,9 @@ def _span(split: Sequence[int]) -> str:
 
 def _rows(group: Group, name: str, split: str, label: str, *, row: str | None = None) -> list[list[str]]:
     """The lines of the training views and, if measured, of the held-out views."""
-    lines: list[list[str]] = []
-    for views, title in (("train", "training"), ("heldout", "new")):
-        line = _row(group, name, split, views, label, row=row)
-        if any(map(_is_figure, line[1:4])) or views == "train":
-            lines.append([label if not lines else "", title, *(line[1:] if not lines else [*line[1:4], "", ""])])
-    return lines
+    trained, new = (_row(group, name, split, views, label, row=row) for views in ("train", "heldout"))
+    lines = [[label, "training", *trained[1:]]]
+    return [*lines, ["", "new", *new[1:4], "", ""]] if any(map(_is_figure, new[1:4])) else lines
 
 
 def _row(group: Group, name: str, split: str, views: str, label: str, *, row: str | None = None) -> list[str]:

@@ -7,6 +7,7 @@ sequences. Energies of frame t are those of the step from t-1 to t, and exist fo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,11 @@ class ObjectCurves:
         """Columns of the view axis of group ``train`` or ``heldout``."""
         trained = [v in self.facts.train_views for v in self.facts.views]
         return [i for i, t in enumerate(trained) if t == (group == "train")]
+
+
+def finite(value: float) -> float | None:
+    """The number as JSON holds it: None if it is NaN or infinite."""
+    return float(value) if math.isfinite(value) else None
 
 
 def save_curves(path: Path, objects: list[ObjectCurves]) -> None:

@@ -1,4 +1,4 @@
-"""Diagnosis of predictions whose true motion is known: frequency, damping, phase and first velocity."""
+"""Diagnosis of predictions whose true motion is known (frequency, damping, phase, first velocity), and its reader."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -19,7 +20,10 @@ from gausim.metrics.oscillation import (
     spectrum,
     velocity_cosine,
 )
-from gausim.results.curves import TRUTH
+from gausim.results.curves import TRUTH, finite
+from gausim.results.summary import dig
+
+Number = float | None
 
 # Number of principal motions; further ones are too small for an estimate of their frequency.
 MOTIONS = 8
@@ -70,16 +74,16 @@ class Diagnosis:
             rings = [oscillation([s[:, m] for s in series], self._fps) for m in range(len(fraction))]
             row: dict[str, Any] = {
                 "spectrum": power.tolist(),
-                "frequencies": [_finite(ring.frequency) for ring in rings],
-                "dampings": [_finite(ring.damping) for ring in rings],
+                "frequencies": [finite(ring.frequency) for ring in rings],
+                "dampings": [finite(ring.damping) for ring in rings],
             }
             if name != TRUTH:
-                row["phase_error"] = [_finite(v) for v in phase_error(series, truth)]
+                row["phase_error"] = [finite(v) for v in phase_error(series, truth)]
                 row["velocity_cosine"] = _mean(
                     [velocity_cosine(p, t) for p, t in zip(motions, self._truth, strict=True)]
                 )
             if name in self._levels:
-                row["level_errors"] = [_finite(own / still if still else math.nan) for own, still in self._levels[name]]
+                row["level_errors"] = [finite(own / still if still else math.nan) for own, still in self._levels[name]]
             found["frequency"] = frequency.tolist()
             found["rows"][name] = row
         return found
@@ -94,5 +98,61 @@ def _mean(values: Sequence[float]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+class Motion(msgspec.Struct):
+    """Motion of one row, with None for undefined figures."""
+
+    spectrum: list[float]  # power per frequency
+    frequencies: list[Number]  # frequency of each principal motion [Hz]
+    dampings: list[Number]  # damping of each principal motion, as a fraction of critical damping
+    phase_error: list[Number] = []  # phase error per frame [degrees]
+    velocity_cosine: Number = None  # cosine between the first velocity and the true one
+    level_errors: list[Number] = []  # errors over the static prediction's of the units of each level, the finest first
+
+
+class DiagnosisFigures(msgspec.Struct):
+    """Diagnosis of one object, read from its entry."""
+
+    # fraction of the squared displacement in each principal motion (key ``share`` of the file)
+    fraction: list[float] = msgspec.field(name="share")
+    frequency: list[float]  # frequencies of the spectra [Hz]
+    rows: dict[str, Motion]  # the truth and the predictions
+    first_unseen: int = 0  # first unseen frame
+
+    def frequency_error(self, row: str) -> float:
+        """Mean over principal motions, weighted by :attr:`fraction`, of the relative error of the frequency."""
+        found, true = (numbers(self.rows[r].frequencies) for r in (row, TRUTH))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self._mean(np.where(true > 0, np.abs(found / true - 1), np.nan))
+
+    def damping_ratio(self, row: str) -> float:
+        """Predicted over true damping, both as weighted means over the principal motions that oscillate in both."""
+        both = np.stack([numbers(self.rows[r].dampings) for r in (row, TRUTH)])
+        found, true = np.where(np.isfinite(both).all(0), both, np.nan)
+        return self._mean(found) / (self._mean(true) or float("nan"))
+
+    def phase(self, row: str, *, seen: bool) -> float:
+        """Mean phase error of the seen or the unseen frames [degrees]."""
+        values = numbers(self.rows[row].phase_error)
+        part = values[: self.first_unseen] if seen else values[self.first_unseen :]
+        return float(part[np.isfinite(part)].mean()) if np.isfinite(part).any() else float("nan")
+
+    def _mean(self, values: NDArray) -> float:
+        known, weights = np.isfinite(values), numbers(self.fraction)
+        return float(np.average(values[known], weights=weights[known])) if weights[known].any() else float("nan")
+
+
+def read_diagnosis(entry: Mapping[str, Any]) -> DiagnosisFigures | None:
+    """The diagnosis of an object's entry in metrics.json; None if it is missing or malformed."""
+    try:
+        found = msgspec.convert(entry.get("diagnosis"), DiagnosisFigures)
+        found.first_unseen = msgspec.convert(dig(entry, "splits", "seen"), tuple[int, int])[1]
+    except msgspec.ValidationError:
+        return None
+    size = len(found.frequency), len(found.fraction), len(found.fraction)
+    sizes = {(len(m.spectrum), len(m.frequencies), len(m.dampings)) for m in found.rows.values()}
+    return found if TRUTH in found.rows and sizes == {size} and all(size) else None
+
+
+def numbers(values: Sequence[Number]) -> NDArray:
+    """The figures as an array, with NaN for undefined ones."""
+    return np.array(values, float)

@@ -48,7 +48,6 @@ relative errors of both, and the deepest point of all below the floor [% of diag
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from pathlib import Path
@@ -58,6 +57,7 @@ import msgspec
 import numpy as np
 
 from gausim.core import RunError
+from gausim.io.files import write_json
 from gausim.io.plain_json import parse_json
 from gausim.results.curves import (
     CHAMFER,
@@ -69,6 +69,7 @@ from gausim.results.curves import (
     TRACK_ERROR,
     TRUTH,
     ObjectCurves,
+    finite,
 )
 
 # Frames after the last seen one, of the entry ``horizon``.
@@ -137,10 +138,7 @@ def summarise(curves: ObjectCurves) -> dict[str, Any]:
     facts = curves.facts
     splits = frame_splits(max(facts.frames), facts.first_unseen)
     groups = {g: curves.view_indices(g) for g in ("train", "heldout")}
-    metrics = {
-        m.key: {"label": m.label, "scale": m.scale, "unit": m.unit, "higher_is_better": m.higher_is_better}
-        for m in facts.metrics
-    }
+    metrics = {m.key: {key: value for key, value in vars(m).items() if key != "key"} for m in facts.metrics}
     color = [float(c) for c in facts.mean_color]
     return {
         "fps": facts.fps,
@@ -174,6 +172,8 @@ def _row(
 ) -> dict[str, Any]:
     """Cells of one row: split -> group -> metric; groups without data are left out."""
     result: dict[str, Any] = {}
+    references = curves.values.get(curves.facts.reference, {})
+    without_ratio = {m.key for m in curves.facts.metrics if m.higher_is_better}  # one of decibels has no meaning
     for split, (start, stop) in splits.items():
         cells: dict[str, dict[str, Any]] = {}
         for metric, values in curves.values[row].items():
@@ -183,9 +183,9 @@ def _row(
                     true = _window(curves.values[TRUTH][metric], start, stop, views)
                     cells.setdefault(group, {})[MOTION_ENERGY] = _energy_cell(window, true)
                 else:
-                    base = curves.values.get(curves.facts.reference, {}).get(metric)
+                    base = None if metric in without_ratio else references.get(metric)
                     reference = None if base is None else _means(_window(base, start, stop, views))
-                    cells.setdefault(group, {})[metric] = _cell(_means(window), _ratio_base(curves, metric, reference))
+                    cells.setdefault(group, {})[metric] = _cell(_means(window), reference)
         result[split] = cells
     return result
 
@@ -202,7 +202,7 @@ def _horizon(curves: ObjectCurves, groups: dict[str, list[int]]) -> dict[str, An
                 frames = np.moveaxis(values[:, [last + n for n in ahead]], 1, 0)  # None where every sequence has ended
                 for group, views in _places(metric, groups).items():
                     means = _means((frames if views is None else frames[..., views]).reshape(len(ahead), -1))
-                    found.setdefault(group, {})[metric] = [_finite(float(mean)) for mean in means]
+                    found.setdefault(group, {})[metric] = [finite(float(mean)) for mean in means]
     return {"frames": ahead, "rows": rows}
 
 
@@ -215,12 +215,6 @@ def _window(values: np.ndarray, start: int, stop: int, views: list[int] | None) 
     """(S, all other axes) of the chosen frames and views."""
     window = values[:, start:stop] if views is None else values[:, start:stop][:, :, views]
     return window.reshape(len(values), -1)
-
-
-def _ratio_base(curves: ObjectCurves, metric: str, reference: np.ndarray | None) -> np.ndarray | None:
-    """Denominator of ratios; None for metrics that are better when higher (a ratio of decibels has no meaning)."""
-    better = {m.key: m.higher_is_better for m in curves.facts.metrics}
-    return None if better.get(metric, False) else reference
 
 
 def _means(values: np.ndarray) -> np.ndarray:
@@ -236,7 +230,7 @@ def _cell(values: np.ndarray, reference: np.ndarray | None = None) -> dict[str, 
     ratio = math.nan
     if reference is not None and not np.isnan(reference).all() and np.nanmean(reference) > 0:
         ratio = mean / float(np.nanmean(reference))
-    return {"mean": _finite(mean), "std": _finite(std), "ratio": _finite(ratio)}
+    return {"mean": finite(mean), "std": finite(std), "ratio": finite(ratio)}
 
 
 def _energy_cell(predicted: np.ndarray, true: np.ndarray) -> dict[str, float | None]:
@@ -244,11 +238,7 @@ def _energy_cell(predicted: np.ndarray, true: np.ndarray) -> dict[str, float | N
     p, t = (np.where(both, v, 0.0).sum(1) for v in (predicted, true))
     own = np.divide(p, t, out=np.full_like(p, np.nan), where=t > 0)
     pooled = float(p.sum() / t.sum()) if t.sum() > 0 else math.nan
-    return {**_cell(own), "ratio": None, "pooled": _finite(pooled)}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return {**_cell(own), "ratio": None, "pooled": finite(pooled)}
 
 
 def write_summary(
@@ -257,7 +247,7 @@ def write_summary(
     """Writes ``metrics.json`` and returns its data."""
     entries = {c.facts.name: summarise(c) for c in objects}
     summary = {"schema": SCHEMA, "run": run, "provenance": provenance or {}, "objects": entries}
-    path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    write_json(path, summary)
     return summary
 
 
@@ -281,3 +271,10 @@ def load_summary(path: Path) -> dict[str, Any]:
     except msgspec.ValidationError as error:
         raise RunError(f"{path}: {error}. Run `gausim evaluate RUN` again.") from error
     return dict(summary)
+
+
+def dig(node: Any, *keys: str) -> Any:
+    """The value in nested dictionaries under these keys; None if there is none."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node

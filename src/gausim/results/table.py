@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from gausim.metrics.image import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.results.curves import ERROR_3D, STATIC, TRACK_ERROR
-from gausim.results.summary import MOTION_ENERGY
+from gausim.results.summary import MOTION_ENERGY, dig
 
 SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, first", "unseen_all": "unseen, all"}
 GROUP_TITLES = {"points": "3D, true points", "train": "training views", "heldout": "views never trained on"}
@@ -22,6 +23,29 @@ FLOOR_ROW = "floor"
 NO_FORESIGHT = "Does not foresee: its frames after the trained ones repeat what was fitted."
 
 
+class BounceFigure(NamedTuple):
+    """How a figure of the first bounce is printed."""
+
+    key: str  # in the entry ``bounce`` of ``metrics.json``
+    head: str  # heading where the title names the unit
+    label: str  # heading with the unit
+    scale: float
+    digits: int
+    sign: str = ""  # after the figure
+
+
+BOUNCE = (
+    BounceFigure("height", "highest point", "highest point after the impact [scene units]", 1.0, 3),
+    BounceFigure("height_error", "its error", "its error [%]", 100.0, 1, " %"),
+    BounceFigure("rise", "rise", "rise [scene units]", 1.0, 3),
+    BounceFigure("rise_error", "its error", "its error [%]", 100.0, 1, " %"),
+    BounceFigure(
+        "depth", "deepest below the floor [% of diagonal]", "deepest below the floor [% of the diagonal]", 1, 2
+    ),
+)
+CONTRAST_HEAD = ("mean foreground colour", "its norm", "largest l2 of a pixel")
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of text; ``breaks`` are the rows at which a new range of frames begins."""
@@ -29,7 +53,7 @@ class Table:
     title: str
     head: list[str]
     rows: list[list[str]]
-    breaks: list[int]
+    breaks: Sequence[int] = ()
 
 
 def object_tables(name: str, entry: dict[str, Any]) -> list[Table]:
@@ -48,21 +72,14 @@ def horizon_table(name: str, entry: dict[str, Any]) -> Table | None:
     found = entry.get("horizon") or {}
     if not found.get("frames"):
         return None
-    shown = [("points", ERROR_3D), ("train", "psnr"), ("heldout", "psnr")]
-    rows: list[list[str]] = []
-    breaks = []
-    for group, metric in shown:
+    rows = []
+    for group, metric in (("points", ERROR_3D), ("train", "psnr"), ("heldout", "psnr")):
         own = {row: means for row, groups in found["rows"].items() if (means := groups.get(group, {}).get(metric))}
-        if own:
-            breaks.append(len(rows))
         info = entry["metrics"].get(metric, {})
         where = f"{info.get('label', metric)} [{info.get('unit', '')}], {GROUP_TITLES[group]}"
         rows += [[where, row, *(_number(mean, 2) for mean in means)] for row, means in own.items()]
     head = ["figure", "row", *(f"+{frames}" for frames in found["frames"])]
-    return Table(f"{name}: by frames ahead of the last seen one", head, rows, breaks)
-
-
-BOUNCE_HEAD = ("highest point", "its error", "rise", "its error", "deepest below the floor [% of diagonal]")
+    return Table(f"{name}: by frames ahead of the last seen one", head, rows)
 
 
 def bounce_table(name: str, entry: dict[str, Any]) -> Table | None:
@@ -70,50 +87,29 @@ def bounce_table(name: str, entry: dict[str, Any]) -> Table | None:
     found = entry.get("bounce")
     if not found:
         return None
-    rows = [[row, *bounce_texts(figures)] for row, figures in found.items()]
-    return Table(
-        f"{name}: centre after the first contact with the floor [scene units]", ["row", *BOUNCE_HEAD], rows, []
-    )
-
-
-def bounce_texts(figures: dict[str, Any]) -> list[str]:
-    """The columns of :data:`BOUNCE_HEAD`."""
-
-    def percent(value: float | None) -> str:
-        return "" if value is None else f"{100 * value:.1f} %"
-
-    height, rise = _number(figures["height"], 3), _number(figures["rise"], 3)
-    errors = percent(figures["height_error"]), percent(figures["rise_error"])
-    return [height, errors[0], rise, errors[1], _number(figures["depth"], 2)]
+    rows = [[row, *(_number(told[f.key], f.digits, f.scale, f.sign) for f in BOUNCE)] for row, told in found.items()]
+    title = f"{name}: centre after the first contact with the floor [scene units]"
+    return Table(title, ["row", *(f.head for f in BOUNCE)], rows)
 
 
 def _group_table(name: str, entry: dict[str, Any], group: str) -> Table:
-    metrics = _metrics_of(entry, group)
+    found = [m for row in entry["rows"].values() for split in row.values() for m in split.get(group, {})]
+    metrics = sorted(dict.fromkeys(found), key=lambda m: m == MOTION_ENERGY)
     infos = {m: entry["metrics"].get(m) or entry["metrics"][MOTION_ENERGY] for m in metrics}
     head = ["frames", "row"]
     for metric, info in infos.items():
         head.append(f"{info['label']} [{info['unit']}]" if info["unit"] else info["label"])
         if _has_ratio(metric, info):
             head.append(f"/ {reference_row(entry)}")
-    rows, breaks = [], []
+    rows = []
     if group == "train" and entry["floor"]:
         rows.append(_line("0", FLOOR_ROW, entry["floor"], infos))
     for split, (start, stop) in entry["splits"].items():
-        breaks.append(len(rows))
         frames = f"{SPLIT_TITLES[split]} {start}..{stop - 1}"
         for row, cells in entry["rows"].items():
             if group in cells[split]:
                 rows.append(_line(frames, row, cells[split][group], infos))
-    return Table(f"{name}: {GROUP_TITLES[group]}", head, rows, breaks)
-
-
-def _metrics_of(entry: dict[str, Any], group: str) -> list[str]:
-    """Metrics of any row in this group, in their first order, the energy last."""
-    found: dict[str, None] = {}
-    for row in entry["rows"].values():
-        for split in row.values():
-            found.update(dict.fromkeys(split.get(group, {})))
-    return sorted(found, key=lambda m: m == MOTION_ENERGY)
+    return Table(f"{name}: {GROUP_TITLES[group]}", head, rows)
 
 
 def _has_ratio(metric: str, info: dict[str, Any]) -> bool:
@@ -146,23 +142,22 @@ def spread(deviation: float, digits: int = 2) -> str:
     return f"± {deviation:.{digits}f}"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
+def _number(value: float | None, digits: int, scale: float = 1.0, sign: str = "") -> str:
+    return "" if value is None else f"{value * scale:.{digits}f}{sign}"
 
 
 def footnotes_of(entry: dict[str, Any], method: str) -> dict[str, Any]:
     """The ``footnotes`` of a method in an object's entry; empty if there are none."""
-    every = entry.get("footnotes")
-    own = every.get(method) if isinstance(every, dict) else None
+    own = dig(entry, "footnotes", method)
     return own if isinstance(own, dict) else {}
 
 
 def footnotes(entry: dict[str, Any], method: str) -> list[str]:
     """Notes on a method in an object's entry, in sentences; the first states that it does not extrapolate."""
     own = footnotes_of(entry, method)
+    sentences = [NO_FORESIGHT] if own.get("extrapolates") is False else []
     notes = own.get("notes")
-    sentences = [str(note) for note in notes] if isinstance(notes, list) else []
-    return [NO_FORESIGHT, *sentences] if own.get("extrapolates") is False else sentences
+    return sentences + ([str(note) for note in notes] if isinstance(notes, list) else [])
 
 
 def gaps(summary: dict[str, Any]) -> list[str]:
@@ -174,14 +169,14 @@ def gaps(summary: dict[str, Any]) -> list[str]:
 
 def markdown_table(table: Table) -> str:
     """One table as GitHub Markdown, its title as a heading."""
-    lines = [f"### {table.title}", "", _markdown_row(table.head)]
     texts = 1 if table.head[0] == "row" else 2
-    lines.append(_markdown_row(["---"] * texts + ["---:"] * (len(table.head) - texts)))
-    return "\n".join(lines + [_markdown_row(row) for row in table.rows]) + "\n"
+    rule = ["---"] * texts + ["---:"] * (len(table.head) - texts)
+    return f"### {table.title}\n\n{markdown_rows([table.head, rule, *table.rows])}\n"
 
 
-def _markdown_row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def markdown_rows(rows: Sequence[Sequence[str]]) -> str:
+    """The rows of a table as GitHub Markdown, the rule below the first among them."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def markdown(summary: dict[str, Any]) -> str:
@@ -199,10 +194,13 @@ def markdown(summary: dict[str, Any]) -> str:
 
 def _contrast(summary: dict[str, Any]) -> str:
     """The paper's table of colour contrast, on which absolute errors of objects depend."""
-    head = ["object", "mean foreground colour", "its norm", "largest l2 of a pixel"]
-    rows = []
-    for name, entry in summary["objects"].items():
-        contrast = entry["contrast"]
-        color = ", ".join(f"{c:.2f}" for c in contrast["mean_color"])
-        rows.append([name, f"({color})", f"{contrast['norm']:.2f}", f"{contrast['max_l2']:.2f}"])
-    return "## Colour contrast\n\n" + markdown_table(Table("foreground against black", head, rows, []))
+    contrasts = {name: entry["contrast"] for name, entry in summary["objects"].items()}
+    rows = [[name, *contrast_texts(c["mean_color"], c["norm"], c["max_l2"])] for name, c in contrasts.items()]
+    return "## Colour contrast\n\n" + markdown_table(
+        Table("foreground against black", ["object", *CONTRAST_HEAD], rows)
+    )
+
+
+def contrast_texts(mean_color: Sequence[float], norm: float, max_l2: float) -> tuple[str, str, str]:
+    """The columns of :data:`CONTRAST_HEAD`."""
+    return f"({', '.join(f'{c:.2f}' for c in mean_color)})", f"{norm:.2f}", f"{max_l2:.2f}"

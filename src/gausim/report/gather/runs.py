@@ -9,8 +9,8 @@ import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import yaml
 
 from gausim.core import RunError
 from gausim.io.files import read_yaml
-from gausim.results.summary import load_summary
+from gausim.results.summary import dig, load_summary
 from gausim.runs.defaults import flatten
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_names
@@ -35,6 +35,7 @@ _HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
 
 EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
 FAILURE, BROKEN = "failed", "broken files"
+NOT_RECORDED = "not recorded"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,12 @@ class RunRecord:
     config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty if unreadable
     choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
     summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
-    command: str = "not recorded"  # by which it was trained, of a sweep that of the whole
+    command: str = NOT_RECORDED  # by which it was trained, of a sweep that of the whole
+
+    @property
+    def given_name(self) -> str:
+        """The name in its configuration, else that of its folder."""
+        return str(self.config.get("name") or self.name)
 
     @property
     def seed(self) -> Any:
@@ -107,25 +113,18 @@ class RunRecord:
         return f"gausim {version}" if isinstance(version, str) else "?"
 
     @property
-    def data_hashes(self) -> dict[str, tuple[str, str]]:
+    def data_hashes(self) -> dict[str, list[str]]:
         """First digits of the hashes of every object's scene and manifest, or ``?`` if not recorded."""
-
-        def digits(entry: dict[str, Any], key: str) -> str:
-            return (dig(entry, "sources", key, "sha256") or "?")[:_DIGITS]
-
-        return {name: (digits(entry, "scene"), digits(entry, "manifest")) for name, entry in self.objects.items()}
+        files = ("scene", "manifest")
+        return {
+            name: [(dig(entry, "sources", file, "sha256") or "?")[:_DIGITS] for file in files]
+            for name, entry in self.objects.items()
+        }
 
     @property
     def is_from_unfinished(self) -> bool:
         """Whether its figures are of an unfinished training."""
         return self.summary is not None and self.summary["run"].get("finished") is False
-
-
-def dig(node: Any, *keys: str) -> Any:
-    """The value in nested dictionaries under these keys; None if there is none."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
@@ -140,20 +139,16 @@ def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRec
             raise RunError(f"{root}: no such directory. Name run directories, sweeps, or a folder of them.")
         for folder in _run_folders(root, skip.resolve() if skip is not None else None):
             name = root.name if folder == root else str(folder.relative_to(root))
-            record = _read_files(folder, f"{root.name}/{name}" if len(roots) > 1 else name)
-            found.setdefault(folder.resolve(), replace(record, command=_command(folder)))
+            found.setdefault(folder.resolve(), _read_run(folder, f"{root.name}/{name}" if len(roots) > 1 else name))
     if not found:
-        raise RunError(
-            f"{', '.join(str(r) for r in roots)}: no run in here (no {CONFIG} of `gausim train`). "
-            "Train and evaluate first."
-        )
+        places = ", ".join(map(str, roots))
+        raise RunError(f"{places}: no run in here (no {CONFIG} of `gausim train`). Train and evaluate first.")
     return list(found.values())
 
 
 def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
     """Run directories, and directories of Hydra jobs that did not start a run."""
-    dead: list[Path] = []
-    alive: list[Path] = []
+    alive, dead = list[Path](), list[Path]()
     for name, folders, files in os.walk(root):
         folder = Path(name)
         folders[:] = sorted(f for f in folders if not f.startswith(".") and (folder / f).resolve() != skip)
@@ -173,48 +168,53 @@ def _is_run(folder: Path) -> bool:
         return any((folder / trace).exists() for trace in _TRACES)
 
 
-def _command(folder: Path) -> str:
-    """The command of a run from Hydra's records: of a job that of its sweep, unless another has taken its place."""
-    sweep = next((parent for parent in folder.resolve().parents if (parent / _SWEEP).is_file()), None)
+def _read_run(folder: Path, name: str) -> RunRecord:
     try:
         job = read_yaml(folder / _HYDRA / "hydra.yaml")
-        whole = read_yaml(sweep / _SWEEP) if sweep is not None and dig(job, "hydra", "mode") == "MULTIRUN" else {}
     except ValueError:
-        return "not recorded"
-    own, words = _words(job), _words(whole)
-    values = dict(word.lower().partition("=")[::2] for word in own)
-    asked = [word.lower().partition("=")[::2] for word in words]  # Hydra writes the booleans of jobs as False, True
-    is_its = bool(words) and all(key in values and values[key] in value for key, value in asked)
-    return " ".join(["gausim train", *(["-m", *words] if is_its else own)])
-
-
-def _words(config: dict[str, Any]) -> list[str]:
-    words = dig(config, "hydra", "overrides", "task")
-    return [shlex.quote(str(word)) for word in words] if isinstance(words, list) else []
-
-
-def _read_files(folder: Path, name: str) -> RunRecord:
-    choices = _choices(folder)
+        job = {}
+    chosen = dig(job, "hydra", "runtime", "choices")
+    choices = {str(k): str(v) for k, v in chosen.items()} if isinstance(chosen, dict) else {}
+    made = partial(RunRecord, folder, name, choices=choices, command=_command(folder, job))
     is_run = (folder / CONFIG).is_file()
     path = (folder if is_run else folder / _HYDRA) / CONFIG
     try:
         config = read_yaml(path)
     except ValueError as error:
-        return RunRecord(folder, name, BROKEN, str(error), choices=choices)
+        return made(BROKEN, str(error))
     try:
         config = with_present_names(config)
     except (IndexError, TypeError, ValueError) as error:
-        return RunRecord(folder, name, BROKEN, f"{path}: its levels cannot be read ({error}).", choices=choices)
+        return made(BROKEN, f"{path}: its levels cannot be read ({error}).")
     metrics = folder / EVALUATION
-    if metrics.is_file():
-        try:
-            summary = load_summary(metrics)
-        except (RunError, OSError) as error:
-            return RunRecord(folder, name, BROKEN, str(error), config, choices)
-        unfinished = summary["run"].get("finished") is False
-        detail = f"measured before it was finished, {_progress(folder)}" if unfinished else ""
-        return RunRecord(folder, name, EVALUATED, detail, config, choices, summary)
-    return RunRecord(folder, name, *_state(folder, is_run), config, choices)
+    if not metrics.is_file():
+        return made(*_state(folder, is_run), config)
+    try:
+        summary = load_summary(metrics)
+    except (RunError, OSError) as error:
+        return made(BROKEN, str(error), config)
+    unfinished = summary["run"].get("finished") is False
+    detail = f"measured before it was finished, {_progress(folder)}" if unfinished else ""
+    return made(EVALUATED, detail, config, summary=summary)
+
+
+def _command(folder: Path, job: dict[str, Any]) -> str:
+    """The command of a run from Hydra's records: of a job that of its sweep, unless another has taken its place."""
+    sweep = next((parent for parent in folder.resolve().parents if (parent / _SWEEP).is_file()), None)
+    try:
+        whole = read_yaml(sweep / _SWEEP) if sweep is not None and dig(job, "hydra", "mode") == "MULTIRUN" else {}
+    except ValueError:
+        return NOT_RECORDED
+    own, words = _words(job), _words(whole)
+    values = dict(word.lower().partition("=")[::2] for word in own)
+    asked = [word.lower().partition("=")[::2] for word in words]  # Hydra writes the booleans of jobs as False, True
+    is_its = bool(words) and all(key in values and values[key] in value for key, value in asked)
+    return " ".join(["gausim train", *(["-m", *words] if is_its else own)]) if job else NOT_RECORDED
+
+
+def _words(config: dict[str, Any]) -> list[str]:
+    words = dig(config, "hydra", "overrides", "task")
+    return [shlex.quote(str(word)) for word in words] if isinstance(words, list) else []
 
 
 def _state(folder: Path, is_run: bool) -> tuple[str, str]:
@@ -236,11 +236,3 @@ def _progress(folder: Path) -> str:
     except (OSError, csv.Error):
         rows = []
     return f"epoch {rows[-1].get('epoch')}" if rows else "no epoch done"
-
-
-def _choices(folder: Path) -> dict[str, str]:
-    try:
-        node = dig(read_yaml(folder / _HYDRA / "hydra.yaml"), "hydra", "runtime", "choices")
-    except ValueError:
-        return {}
-    return {str(k): str(v) for k, v in node.items()} if isinstance(node, dict) else {}

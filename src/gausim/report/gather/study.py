@@ -6,12 +6,12 @@ import json
 import math
 import statistics
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, INIT_FROM, NOT_EVALUATED, UNFINISHED, RunRecord, dig
-from gausim.results.summary import MOTION_ENERGY
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, INIT_FROM, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import footnotes
 
 FULL = "full"
@@ -34,10 +34,10 @@ About = dict[tuple[str, ...], tuple[RunRecord, ...]]
 class Value:
     """A figure of a row, over sequences and, if there are several, seeds."""
 
-    mean: float  # of all seeds' means over sequences
-    std: float | None  # standard deviation over sequences (over seeds: root of the mean square)
-    seed_std: float | None  # standard deviation of the seeds' means (n - 1); None for one seed
-    seeds: int
+    mean: float  # of all seeds
+    seeds: tuple[float, ...]  # of each seed, the mean over sequences
+    seed_std: float | None  # sample standard deviation of the seeds (n - 1); None for one seed
+    std: float | None = None  # standard deviation over sequences (over seeds: root of the mean square)
 
 
 @dataclass(frozen=True)
@@ -115,40 +115,36 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
         key = json.dumps(run.settings, sort_keys=True) if run.config else str(run.path)
         by_config.setdefault(key, []).append(run)
     members = _rows([tuple(same) for same in by_config.values()], runs)
-    named = [_names(next(iter(about.values()))[0], max(map(len, about))) for about in members]
-    labels = _distinct(named, members)
-    groups = [
-        Group(label if method is None else f"{label}: {method}", family, variation, method or row, about)
-        for (label, family, variation), about in zip(labels, members, strict=True)
-        for method, row in _methods([run for same in about.values() for run in same])
-    ]
+    named = [_names(_first(about), max(map(len, about))) for about in members]
+    groups = []
+    for (label, family, variation), about in zip(_distinct(named, members), members, strict=True):
+        evaluated = [entry for same in about.values() for run in same for entry in run.objects.values()]
+        methods = list(dict.fromkeys(method for entry in evaluated for method in entry["methods"])) or [""]
+        for method in methods:
+            shown = f"{label}: {method}" if len(methods) > 1 else label
+            groups.append(Group(shown, family, variation, method, about))
     families = list(dict.fromkeys(g.family for g in groups))
     groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
-    # A dictionary keeps the order and removes duplicates.
-    known = dict.fromkeys(o for g in groups for run in g.evaluated for o in run.objects)
-    every = known | dict.fromkeys(o for g in groups for o in g.objects)
-    return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)), _test_part(groups))
+    objects = [o for g in groups for run in g.evaluated for o in run.objects] + [o for g in groups for o in g.objects]
+    names = tuple(dict.fromkeys(objects))
+    return Study(tuple(runs), tuple(groups), names, tuple(_notes(groups)), _test_part(groups))
+
+
+def _first(about: About) -> RunRecord:
+    return next(iter(about.values()))[0]
 
 
 def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
     """Joins runs that differ by their single object into one row; joint runs are separate rows."""
     rows: list[About] = []
     for same in members:
-        names = _objects(same, runs)
-        fitting = (row for row in rows if len(names) == 1 and _continues(row, names, same[0]))
-        row = next(fitting, None)
+        names, own = _objects(same, runs), _besides_object(same[0])
+        single = [row for row in rows if all(len(other) == 1 for other in (names, *row)) and same[0].config]
+        row = next((row for row in single if names not in row and _besides_object(_first(row)) == own), None)
         if row is None:
-            rows.append({names: same})
-        else:
-            row[names] = same
+            rows.append(row := {})
+        row[names] = same
     return rows
-
-
-def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
-    """Whether a run on one object belongs to a row of single objects: another object, other settings equal."""
-    first = next(iter(row.values()))[0]
-    settings, own = (_besides_object(r) for r in (first, run))
-    return names not in row and all(len(other) == 1 for other in row) and bool(run.config) and settings == own
 
 
 def _besides_object(run: RunRecord) -> dict[str, str]:
@@ -167,19 +163,12 @@ def _place(variation: str) -> list[int]:
     return [_ORDER.index(part) if part in _ORDER else len(_ORDER) for part in parts]
 
 
-def _methods(same: Sequence[RunRecord]) -> list[tuple[str | None, str]]:
-    """Methods of the summaries as (suffix of the label, row); usually one method without suffix."""
-    rows = dict.fromkeys(m for r in same for entry in r.objects.values() for m in entry["methods"])
-    return [(None, next(iter(rows), ""))] if len(rows) < 2 else [(m, m) for m in rows]
-
-
 def _objects(same: Sequence[RunRecord], runs: Sequence[RunRecord]) -> tuple[str, ...]:
     """Objects of the runs: from their summaries, else from a run on the same data, else the data's directory."""
-    for pool in (same, [r for r in runs if _data(r) == _data(same[0])]):
-        for run in pool:
-            if run.objects:
-                return tuple(run.objects)
     names, root = _data(same[0])
+    for run in (*same, *(r for r in runs if _data(r) == (names, root))):
+        if run.objects:
+            return tuple(run.objects)
     if isinstance(names, list) and names:
         return tuple(str(n) for n in names)
     roots = root if isinstance(root, list) else [root]
@@ -197,7 +186,7 @@ _SWITCHES = ("no_network", "no_mass", "no_momentum", "no_hierarchy")  # ablation
 def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     """(label, family, variation) from the settings of the configuration, not from its name."""
     simulator = dig(run.config, "model", "simulator")
-    family = run.choices.get("model") or str(run.config.get("name") or run.name)
+    family = run.choices.get("model") or run.given_name
     levels = dig(simulator, "hierarchy", "levels")
     is_flat = isinstance(levels, list) and len(levels) == 1 and dig(levels[0], "diameter") == 0
     head = dig(simulator, "head")
@@ -222,7 +211,7 @@ def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> l
     Of several full configurations, the reference of the ablations keeps the plain label.
     """
     objects = [[name for names in about for name in names] for about in members]
-    firsts = [next(iter(about.values()))[0] for about in members]
+    firsts = [_first(about) for about in members]
     taken = Counter((label, o) for (label, _, _), names in zip(labels, objects, strict=True) for o in names)
     plain = {_reference(family, labels, firsts) for _, family, _ in labels}
     result = []
@@ -251,14 +240,12 @@ def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequ
 
 
 def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:
-    name = str(run.config.get("name") or run.name)
-    if all(str(r.config.get("name") or r.name) != name for r in rivals):
-        return name
+    if all(rival.given_name != run.given_name for rival in rivals):
+        return run.given_name
     own = run.settings
-    keys = sorted(
-        k for k in own if any(r.settings.get(k) != own[k] for r in rivals) and not k.endswith(("name", "root"))
-    )
-    shown = [f"{k.rsplit('.', 1)[-1]}={own[k]}" for k in keys[:_KEYS_IN_NAMES]]
+    differing = {key for key in own if any(rival.settings.get(key) != own[key] for rival in rivals)}
+    keys = sorted(key for key in differing if not key.endswith(("name", "root")))
+    shown = [f"{key.rsplit('.', 1)[-1]}={own[key]}" for key in keys[:_KEYS_IN_NAMES]]
     more = f", {len(keys) - _KEYS_IN_NAMES} more" if len(keys) > _KEYS_IN_NAMES else ""
     return ", ".join(shown) + more if shown else run.name
 
@@ -307,7 +294,7 @@ def _test_part(groups: Sequence[Group]) -> str:
         tested = [(trials, looks) for part, trials, looks in facts if part == "test"]
         if tested:
             trials, looks = (_range([pair[i] for pair in tested]) for i in (0, 1))
-            told.append(f"{group.label}: {_counted(trials, 'trial')}, {_counted(looks, 'look')}")
+            told.append(f"{group.label}: {counted(trials, 'trial')}, {counted(looks, 'look')}")
         others += [group.label] if len(tested) < len(facts) else []
     if not told:
         return ""
@@ -318,8 +305,9 @@ def _test_part(groups: Sequence[Group]) -> str:
     )
 
 
-def _counted(number: str, noun: str) -> str:
-    return f"{number} {noun}" if number == "1" else f"{number} {noun}s"
+def counted(number: int | str, noun: str) -> str:
+    """The number with its noun, in the singular or plural."""
+    return f"{number} {noun}" if str(number) == "1" else f"{number} {noun}s"
 
 
 def _range(values: Sequence[Any]) -> str:
@@ -341,19 +329,15 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
         states = {r.status for r in group.of(name)}
         worst = next((s for s in _WORST if s in states), NOT_MEASURED)
         return Cell(None, worst, group.of(name))
-    found = [(run, find(entry)) for run, entry in entries]
     # Tables show the pooled ratio of the energy, because sequences at rest distort a mean of ratios.
     key = "pooled" if metric == MOTION_ENERGY else "mean"
-    numbers = [(run, dig(c, key), dig(c, "std")) for run, c in found]
-    valid = [(run, mean, std) for run, mean, std in numbers if mean is not None]
-    if not valid:
+    found = [(run, own) for run, entry in entries if dig(own := find(entry), key) is not None]
+    if not found:
         absent = [dig(entry, "absent", metric) for _, entry in entries]
         return Cell(None, next(filter(None, absent), NOT_MEASURED), tuple(run for run, _ in entries))
-    means = [mean for _, mean, _ in valid]
-    stds = [std for _, _, std in valid if std is not None]
-    std = math.sqrt(sum(s * s for s in stds) / len(stds)) if stds and metric != MOTION_ENERGY else None
-    value = Value(statistics.fmean(means), std, deviation(means), len(means))
-    return Cell(value, EVALUATED, tuple(run for run, _, _ in valid))
+    stds = [std for _, own in found if (std := own.get("std")) is not None and metric != MOTION_ENERGY]
+    std = math.sqrt(sum(s * s for s in stds) / len(stds)) if stds else None
+    return Cell(over_seeds([own[key] for _, own in found], std), EVALUATED, tuple(run for run, _ in found))
 
 
 def effect(full: Value | None, value: Value | None) -> tuple[float, float | None] | None:
@@ -362,8 +346,14 @@ def effect(full: Value | None, value: Value | None) -> tuple[float, float | None
         return None
     change, spread = value.mean - full.mean, 0.0
     if full.seed_std is not None and value.seed_std is not None:
-        spread = (full.seed_std**2 / full.seeds + value.seed_std**2 / value.seeds) ** 0.5
+        spread = (full.seed_std**2 / len(full.seeds) + value.seed_std**2 / len(value.seeds)) ** 0.5
     return 100 * change / full.mean, change / spread if spread else None
+
+
+def reference_rows(groups: Iterable[Group], names: Iterable[str]) -> list[str]:
+    """The rows of the objects' evaluations that are no methods."""
+    entries = [entry for group in groups for name in names for _, entry in group.entries(name)]
+    return list(dict.fromkeys(row for entry in entries for row in entry["rows"] if row not in entry["methods"]))
 
 
 def families(groups: Sequence[Group]) -> dict[str, list[Group]]:
@@ -372,9 +362,17 @@ def families(groups: Sequence[Group]) -> dict[str, list[Group]]:
     return {name: sorted(own, key=lambda g: g.variation != FULL) for name, own in found.items() if len(own) > 1}
 
 
-def deviation(values: Sequence[float]) -> float | None:
-    """Sample standard deviation (n - 1); None for fewer than two."""
-    return statistics.stdev(values) if len(values) > 1 else None
+def over_seeds(values: Iterable[Any], std: float | None = None) -> Value | None:
+    """One figure of every seed, with its deviation over sequences; None without any finite number."""
+    seeds = tuple(known for value in values if (known := number(value)) is not None)
+    if not seeds:
+        return None
+    return Value(statistics.fmean(seeds), seeds, statistics.stdev(seeds) if len(seeds) > 1 else None, std)
+
+
+def known(nodes: Iterable[Any], *keys: str) -> list[float]:
+    """The finite numbers that the nodes have under these keys."""
+    return [value for node in nodes if (value := number(dig(node, *keys))) is not None]
 
 
 def number(value: Any) -> float | None:

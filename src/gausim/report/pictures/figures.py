@@ -1,25 +1,31 @@
-"""Figures from result arrays: errors over time, space-time slices, contact sheets."""
+"""Figures of results: errors over time, space-time slices, contact sheets, oscillation, long rollouts."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import FuncFormatter
 
 from gausim.io.files import replacing
 from gausim.report.pictures.frames import error_colors, moving_line, space_time_slice
-from gausim.results.curves import ERROR_3D, ObjectCurves
+from gausim.results.curves import ERROR_3D, TRUTH, ObjectCurves
+from gausim.results.diagnosis import DiagnosisFigures, numbers, read_diagnosis
 
 _DPI = 110
 SEEN_SHADE = "#dde6ee"
 METHOD_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce", "#0e7490", "#a16207", "#be185d", "#4d7c0f")
 _REFERENCE_COLORS = ("#555555", "#999999", "#bbbbbb")
+_GREYS = ("#777777", "#aaaaaa")
+# Labels, each with evaluations (seeds) and the name of their row.
+Rows = Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]]
 
 
 def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = None) -> None:
@@ -29,13 +35,11 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
     save_figure(error_plot([(row, [(curves, row)]) for row in curves.rows], title=title, sequence=sequence), path)
 
 
-def error_plot(
-    rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]], *, title: str = "", sequence: str | None = None
-) -> Figure:
+def error_plot(rows: Rows, *, title: str = "", sequence: str | None = None) -> Figure:
     """Errors over time of every row: 3D if the truth is known, then l2 in the training and held-out views.
 
-    ``rows`` are labels, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band
-    of one standard deviation are over all of them, and over all sequences unless one is named.
+    The mean and, for methods, a band of one standard deviation are over all evaluations of a row, and over all
+    sequences unless one is named.
     """
     first = rows[0][1][0][0]
     panels = [("l2", views) for views in ("train", "heldout") if first.view_indices(views)]
@@ -52,22 +56,16 @@ def error_plot(
     return figure
 
 
-def _error_panel(
-    axes: Axes,
-    rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]],
-    panel: tuple[str, str],
-    sequence: str | None,
-) -> None:
+def _error_panel(axes: Axes, rows: Rows, panel: tuple[str, str], sequence: str | None) -> None:
     metric, views = panel
     methods, references = cycle(METHOD_COLORS), cycle(_REFERENCE_COLORS)
     for label, members in rows:
         is_method = any(row in curves.facts.methods for curves, row in members)
         color = next(methods if is_method else references)
-        lines = [
-            _lines(curves, row, panel, sequence) for curves, row in members if metric in curves.values.get(row, {})
-        ]
-        if not lines:
+        known = [(curves, row) for curves, row in members if metric in curves.values.get(row, {})]
+        if not known:
             continue
+        lines = [_lines(curves, row, panel, sequence) for curves, row in known]
         length = max(line.shape[1] for line in lines)
         padded = [np.pad(n, ((0, 0), (0, length - n.shape[1])), constant_values=np.nan) for n in lines]
         stacked = np.concatenate(padded) * (1.0 if metric == ERROR_3D else 1e3)
@@ -133,13 +131,6 @@ def slice_figure(
     return lines[0]
 
 
-def contact_frames(frames: int, first_unseen: int) -> list[int]:
-    """Frames of a contact sheet: first, last seen, first unseen, last, and evenly spaced ones between."""
-    edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
-    even = np.linspace(0, frames - 1, 8).round().astype(int).tolist()
-    return sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
-
-
 def panels_plot(
     rows: Sequence[tuple[str, Sequence[np.ndarray | None]]], heads: Sequence[tuple[str, bool]], *, title: str = ""
 ) -> Figure:
@@ -162,16 +153,19 @@ def panels_plot(
 def contact_sheet(
     truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
 ) -> None:
-    """Chosen frames of truth, prediction and error below each other; unseen frames have orange numbers.
+    """Frames of truth, prediction and error below each other; unseen frames have orange numbers.
 
-    Films are (F, H, W, 3) uint8; frames beyond the truth are empty.
+    They are the first, the last seen, the first unseen, the last, and evenly spaced ones between. Films are
+    (F, H, W, 3) uint8; frames beyond the truth are empty.
     """
-    chosen = contact_frames(len(prediction), first_unseen)
+    last = len(prediction) - 1
+    edges = {0, min(first_unseen - 1, last), min(first_unseen, last), last}
+    even = np.linspace(0, last, 8).round().astype(int).tolist()
+    chosen = sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
     rows: list[tuple[str, list[np.ndarray | None]]] = [("prediction", [prediction[f] for f in chosen])]
     if truth is not None:
         true = [truth[f] if f < len(truth) else None for f in chosen]
-        pairs = zip(true, chosen, strict=True)
-        errors = [None if image is None else error_colors(image, prediction[f]) for image, f in pairs]
+        errors = [error_colors(truth[f], prediction[f]) if f < len(truth) else None for f in chosen]
         rows = [("ground truth", true), *rows, ("error", errors)]
     save_figure(panels_plot(rows, [(str(f), f >= first_unseen) for f in chosen], title=title), path)
 
@@ -185,6 +179,60 @@ def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path
     for axes, image, label in zip(places, images, labels, strict=False):  # the last row may be incomplete
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
+    save_figure(figure, path)
+
+
+def diagnosis_plot(named: Sequence[tuple[str, DiagnosisFigures, str]], *, title: str) -> Figure:
+    """Spectra and phase errors of the truth and of predictions: label, diagnosis and row in it of each."""
+    figure, (power, phase) = made_figure(1, 2, (10.4, 3.8), title)
+    first = named[0][1]
+    shown = {row for _, _, row in named}
+    others = [r for r in first.rows if r != TRUTH and r not in shown]
+    lines = [(TRUTH, first, TRUTH, "-", "black", 1.6)]
+    lines += [(*item, "-", color, 1.4) for color, item in zip(METHOD_COLORS * len(named), named, strict=False)]
+    lines += [(row, first, row, ":", color, 1.1) for color, row in zip(_GREYS, others, strict=False)]
+    for label, diagnosis, row, style, color, width in lines:
+        motion = diagnosis.rows[row]
+        spectrum = numbers(motion.spectrum)
+        positive = np.where(spectrum > 0, spectrum, np.nan)
+        power.semilogy(diagnosis.frequency, positive, style, color=color, linewidth=width, label=label)
+        if row != TRUTH:
+            phase.plot(numbers(motion.phase_error), style, color=color, linewidth=width)
+    phase.axvspan(-0.5, first.first_unseen - 0.5, color=SEEN_SHADE, linewidth=0, zorder=0)
+    # The page disables formulas, which the default labels contain.
+    power.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}"))
+    power.set(title="power of the motion", xlabel="frequency [Hz]", ylabel="squared displacement per Hz")
+    phase.set(title="phase error [degrees]", xlabel="frame (shaded: seen)", ylim=(0, 130))
+    phase.axhline(180 / np.sqrt(3), color="#999999", linewidth=0.8)
+    phase.text(1, 180 / np.sqrt(3) + 2, "unrelated", fontsize=7, color="#777777")
+    handles, labels = power.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)), fontsize=8)
+    return figure
+
+
+def diagnosis_figure(name: str, entry: Mapping[str, Any], path: Path) -> bool:
+    """Writes the figure of one evaluation; returns False if it has no diagnosis."""
+    found = read_diagnosis(entry)
+    methods = [m for m in entry.get("methods", []) if found is not None and m in found.rows]
+    if found is None or not methods:
+        return False
+    save_figure(diagnosis_plot([(m, found, m) for m in methods], title=f"{name}: motion beside the truth"), path)
+    return True
+
+
+def endurance_figure(name: str, rollouts: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """Motion energy and distance from rest over the frames of every rollout of ``endurance.json``.
+
+    A rollout has ``window`` [frames], and ``energy`` and ``away`` per window.
+    """
+    figure, (left, right) = made_figure(1, 2, (9.6, 3.4), f"{name}, far beyond the recording")
+    for color, (kind, told) in zip(METHOD_COLORS, rollouts.items(), strict=False):
+        frames = (np.arange(len(told["energy"])) + 0.5) * told["window"]
+        left.semilogy(frames, np.maximum(told["energy"], 1e-30), color=color, label=kind)
+        right.plot(frames, 100 * np.asarray(told["away"]), color=color, label=kind)
+    left.set(title="motion energy", xlabel="frame")
+    right.set(title="mean distance from rest [% of diagonal]", xlabel="frame", ylim=(0, None))
+    right.legend(fontsize=8)
     save_figure(figure, path)
 
 

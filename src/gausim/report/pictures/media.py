@@ -1,10 +1,12 @@
-"""Pictures of a report, as data URIs: error curves, space-time slices, frames of several cameras, videos."""
+"""Pictures of a report, as data URIs: videos, error curves, space-time slices, frames of several cameras."""
 
 from __future__ import annotations
 
 import base64
 import io
+import shlex
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +15,23 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
-from gausim.core import GausSimError
+from gausim.core import GausSimError, RunError
 from gausim.io.video import SMALL, write_video
-from gausim.report.gather.diagnosis import read_diagnosis
-from gausim.report.gather.study import Group, Study
-from gausim.report.pictures.figures import error_plot, literal, panels_plot, slices_plot
-from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
-from gausim.report.pictures.motion import diagnosis_plot
+from gausim.report.gather.runs import RunRecord
+from gausim.report.gather.study import Study
+from gausim.report.pictures.figures import diagnosis_plot, error_plot, literal, panels_plot, slices_plot
+from gausim.report.pictures.frames import (
+    ERROR_RANGE,
+    Timeline,
+    brighten,
+    error_colors,
+    label_bar,
+    light_gain,
+    time_line,
+    timeline_bar,
+)
 from gausim.results.curves import ObjectCurves, load_curves
+from gausim.results.diagnosis import read_diagnosis
 from gausim.results.pictures import Pictures, kept_pictures
 
 TRUTH = "ground truth"
@@ -28,6 +39,8 @@ TRUTH = "ground truth"
 MOST_METHODS, MOST_VIEWS = 5, 3
 # Height of a panel of a video [pixels].
 _PANEL = 168
+# Largest width and height of a film's panel [pixels]; length below which it is shown at half speed [s].
+_WIDEST, _HIGHEST, _SHORT = 352, 400, 4.0
 
 
 @dataclass(frozen=True)
@@ -49,14 +62,66 @@ class Shown:
     note: str  # note on their processing, for captions
 
 
+@dataclass(frozen=True)
+class Film:
+    """A video of truth, prediction and error side by side: data URIs of the MP4 and of its poster image."""
+
+    uri: str
+    poster: str
+    width: int  # [pixels]
+    caption: str
+
+
+def make_film(run: RunRecord, name: str, method: str) -> Film:
+    """The video of an evaluated run and object, in the first held-out view, else in the first view.
+
+    Raises:
+        RunError: the evaluation has no pictures of this object and method, or they cannot be read.
+    """
+    found = next((item for item in kept_pictures(run.path, name) if method in item.predictions), None)
+    if found is None:
+        raise RunError(
+            f"its evaluation kept no pictures of {name} predicted by {method}. Make them with `gausim evaluate "
+            f"{shlex.quote(str(run.path))}`."
+        )
+    view = next((i for i, v in enumerate(found.views) if v in found.heldout_views), 0)
+    gain, slow = light_gain(found.truth[:, view]), 2 if len(found.truth) < _SHORT * found.fps else 1
+    frames = list(_film_frames(found, method, view, gain))
+    poster = frames[min(found.first_unseen, len(frames) - 1)]
+    uri = _video_uri(frames, found.fps / slow)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(poster, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    caption = _film_caption(found, found.views[view], gain, slow)
+    return Film(uri, _data_uri("image/jpeg", jpeg.tobytes()), poster.shape[1], caption)
+
+
+def _film_frames(pictures: Pictures, method: str, view: int, gain: float) -> Iterator[np.ndarray]:
+    height, width = pictures.truth.shape[2:4]
+    zoom = min(_WIDEST / width, _HIGHEST / height)
+    # The encoder requires even sizes.
+    size = 2 * max(1, round(width * zoom / 2)), 2 * max(1, round(height * zoom / 2))
+    both = pictures.truth, pictures.predictions[method]
+    truth, predicted = (pictures.over_background(frames)[:, view] for frames in both)
+    timeline = Timeline(len(truth), pictures.first_unseen)
+    for number, (true, ours) in enumerate(zip(truth, predicted, strict=True)):
+        panels = (brighten(true, gain), brighten(ours, gain), error_colors(true, ours))
+        picture = np.concatenate([cv2.resize(p, size, interpolation=cv2.INTER_CUBIC) for p in panels], 1)
+        yield np.concatenate((picture, time_line(number, timeline, picture.shape[1])))
+
+
+def _film_caption(pictures: Pictures, view: str, gain: float, slow: int) -> str:
+    kind = "never trained on" if view in pictures.heldout_views else "a training view; the evaluation has no other"
+    speed = ", at half speed" if slow > 1 else ""
+    bright = f", brightened {gain:g}×" if gain != 1 else ""
+    return (
+        f"{pictures.sequence} in {view} ({kind}){speed}{bright}. Error: distance of the colours, from 0 (black) to "
+        f"{ERROR_RANGE:g} and more (brightest)."
+    )
+
+
 def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
     """All pictures of one object, and the reasons for missing ones."""
-    figures: list[Exhibit] = []
     problems: list[str] = []
-    curves = _curves(study, name, problems)
-    if curves:
-        figures.append(_error_curves(name, curves))
-    figures += _motions(study, name)
+    figures = [*_error_curves(study, name, problems), *_motions(study, name)]
     for shown in _shown(study, name, problems):
         figures += [_slices(shown), _frames(shown)]
         # The first screens have a video of each method; this one compares them.
@@ -79,34 +144,30 @@ def _motions(study: Study, name: str) -> list[Exhibit]:
     return [Exhibit(f"Spectrum and phase: {name}", caption, "image", _drawn(diagnosis_plot(named, title=name)))]
 
 
-def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, list[ObjectCurves]]]:
-    found = []
+def _error_curves(study: Study, name: str, problems: list[str]) -> list[Exhibit]:
+    """Errors over time of all rows, averaged over sequences and seeds; the seen frames are shaded."""
+    rows = []
     for group in study.groups:
-        seeds = []
+        seeds: list[ObjectCurves] = []
         for run, _ in group.entries(name):
             try:
                 seeds += [c for c in load_curves(run.path / "evaluation" / "metrics.npz") if c.facts.name == name]
             except GausSimError as error:
                 problems.append(f"{group.label}: {error}")
-        if seeds:
-            found.append((group, seeds))
-    return found
-
-
-def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
-    """Errors over time of all rows, averaged over sequences and seeds; the seen frames are shaded."""
-    rows = [(group.label, [(c, group.method) for c in seeds]) for group, seeds in curves]
-    first = curves[0][1][0]
+        rows += [(group.label, [(curves, group.method) for curves in seeds])] if seeds else []
+    if not rows:
+        return []
+    first = rows[0][1][0][0]
     figure = error_plot([*rows, (first.facts.reference, [(first, first.facts.reference)])])
     caption = (
         "Mean over sequences and seeds, band: ± one standard deviation over both. Shaded: frames that training saw."
     )
-    return Exhibit(f"Errors over time: {name}", caption, "image", _drawn(figure))
+    return [Exhibit(f"Errors over time: {name}", caption, "image", _drawn(figure))]
 
 
 def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
     """One set of pictures per sequence and cameras, with all runs that have them side by side."""
-    sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = {}
+    sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = defaultdict(list)
     for group in study.groups:
         for run, _ in group.entries(name)[:1]:
             try:
@@ -116,8 +177,7 @@ def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
                 continue
             for p in kept:
                 if group.method in p.predictions:
-                    key = (p.sequence, p.views, p.truth.shape)
-                    sets.setdefault(key, []).append((group.label, p, p.predictions[group.method]))
+                    sets[p.sequence, p.views, p.truth.shape].append((group.label, p, p.predictions[group.method]))
     for members in sets.values():
         if len(members) > MOST_METHODS:
             left = ", ".join(label for label, _, _ in members[MOST_METHODS:])
@@ -130,12 +190,10 @@ def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
     gain = light_gain(first.truth)
     columns = [(TRUTH, first.truth), *((label, frames) for label, _, frames in members)]
     shown = [(label, brighten(first.over_background(frames), gain)) for label, frames in columns]
-    behind = "the original background"
-    if first.background is None:
-        behind = "plain grey (the recording keeps no background)"
+    grey = "plain grey (the recording keeps no background)"
+    behind = grey if first.background is None else "the original background"
     made = f"composited over {behind}, brightened {gain:g}×, made smaller"
-    note = f"{first.sequence}; {made}: for the eye, no number uses this."
-    return Shown(first, shown, note)
+    return Shown(first, shown, f"{first.sequence}; {made}: for the eye, no number uses this.")
 
 
 def _slices(shown: Shown) -> Exhibit:
@@ -164,17 +222,16 @@ def _frames(shown: Shown) -> Exhibit:
 def _video(shown: Shown) -> Exhibit:
     """All methods side by side in several cameras."""
     pictures, views = shown.pictures, _some_views(shown.pictures)
-    uri = video_uri(_video_frames(shown, views), pictures.fps)
+    uri = _video_uri(_video_frames(shown, views), pictures.fps)
     names = ", ".join(_view_name(pictures, v) for v in views)
     return Exhibit(f"Side by side: {pictures.object}", f"Rows: {names}. {shown.note}", "video", uri)
 
 
-def video_uri(frames: Iterable[np.ndarray], fps: float) -> str:
-    """The MP4 of (H, W, 3) uint8 frames as a data URI."""
+def _video_uri(frames: Iterable[np.ndarray], fps: float) -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
         write_video(path, frames, fps, quality=SMALL)
-        return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
+        return _data_uri("video/mp4", path.read_bytes())
 
 
 def _video_frames(shown: Shown, views: Sequence[int]) -> Iterator[np.ndarray]:
@@ -193,9 +250,9 @@ def _video_frames(shown: Shown, views: Sequence[int]) -> Iterator[np.ndarray]:
 
 def _some_views(pictures: Pictures) -> list[int]:
     """A few training cameras, and a held-out one if there is any."""
+    heldout = [i for i, v in enumerate(pictures.views) if v in pictures.heldout_views][:1]
     trained = [i for i, v in enumerate(pictures.views) if v not in pictures.heldout_views]
-    heldout = [i for i, v in enumerate(pictures.views) if v in pictures.heldout_views]
-    return [*trained[: MOST_VIEWS - bool(heldout)], *heldout[:1]]
+    return [*trained[: MOST_VIEWS - len(heldout)], *heldout]
 
 
 def _view_name(pictures: Pictures, view: int) -> str:
@@ -210,4 +267,8 @@ def _short(label: str, most: int = 22) -> str:
 def _drawn(figure: Figure) -> str:
     stream = io.BytesIO()
     literal(figure).savefig(stream, format="webp", pil_kwargs={"quality": 85})
-    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()
+    return _data_uri("image/webp", stream.getvalue())
+
+
+def _data_uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined, TemplateError
 
 from gausim.core import RunError
 from gausim.report.records.record import Cell, Column, Figure, Made, Record, RecordTable, load_record, value_of
+from gausim.results.table import markdown_rows
 
 TEMPLATE = "page.md"
 SEEDS_APART = "± deviation over seeds; in brackets, deviation over sequences (root mean square over seeds)."
@@ -24,31 +25,21 @@ _LATEX = {
 
 def markdown_table(table: RecordTable, escape: Callable[[str], str] = str) -> str:
     """The table as GitHub Markdown, the best figures bold; ``escape`` is applied to every text."""
-    lines = [[escape(text) for text in (*table.stub, *(column.label for column in table.columns))]]
-    lines.append(["---"] * len(lines[0]))
-    for row, texts, best in _printed(table):
-        cells = [f"**{escape(text)}**" if mark else escape(text) for text, mark in zip(texts, best, strict=True)]
-        lines.append([*map(escape, row), *cells])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("|  |", "| |").replace("|  |", "| |")
+    head, *rows = _printed(table, escape, "**{}**")
+    return markdown_rows([head, ["---"] * len(head), *rows]).replace("|  |", "| |").replace("|  |", "| |")
 
 
 def latex_table(table: RecordTable, record: Record) -> str:
     """The table for LaTeX, its origin in comments and caption."""
-    heads = [*table.stub, *(column.label for column in table.columns)]
-    body = []
-    for row, texts, best in _printed(table):
-        cells = [
-            rf"\textbf{{{latex_escape(text)}}}" if mark else latex_escape(text)
-            for text, mark in zip(texts, best, strict=True)
-        ]
-        body.append(" & ".join([*map(latex_escape, row), *cells]) + r" \\")
+    head, *body = (" & ".join(line) + r" \\" for line in _printed(table, latex_escape, r"\textbf{{{}}}"))
+    label = re.sub(r"[^A-Za-z0-9]+", "-", table.key)
     caption = latex_escape(" ".join(filter(None, (f"{table.title or record.title}.", table.caption, record.made.test))))
     return "\n".join([
         *(f"% {' '.join(line.split())}" for line in origin(record.made)),
-        r"\begin{table*}[ht]", r"\centering", rf"\caption{{{caption}}}", rf"\label{{tab:{_label(table.key)}}}",
+        r"\begin{table*}[ht]", r"\centering", rf"\caption{{{caption}}}", rf"\label{{tab:{label}}}",
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         rf"\begin{{tabular}}{{{'l' * len(table.stub)}{'c' * len(table.columns)}}}", r"\toprule",
-        " & ".join(map(latex_escape, heads)) + r" \\", r"\midrule", *body, r"\bottomrule", r"\end{tabular}}",
+        head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}}",
         r"\end{table*}", "",
     ])  # fmt: skip
 
@@ -118,20 +109,13 @@ def page(folder: Path) -> str:
     environment.globals = {
         "table": lambda name, key: markdown_table(known(name).table(key)),
         "made": lambda name: _block(known(name).made),
-        **{name: _Facts(record.facts) for name, record in records.items()},
+        **{name: {key: _text(fact, None) for key, fact in record.facts.items()} for name, record in records.items()},
     }
     try:
         text = environment.from_string((folder / TEMPLATE).read_text()).render()
     except (OSError, TemplateError) as error:
         raise RunError(f"{folder / TEMPLATE}: cannot be made into a page ({error}).") from error
     return f"<!-- Made by `make results` from docs/results/: change the template or the records there. -->\n{text}"
-
-
-class _Facts(dict[str, str]):
-    """Facts as attributes of a template's names, as printed."""
-
-    def __init__(self, facts: Mapping[str, float | str]) -> None:
-        super().__init__({name: v if isinstance(v, str) else _number(v, None) for name, v in facts.items()})
 
 
 def _block(made: Made) -> str:
@@ -146,19 +130,18 @@ def _listed(made: Made) -> list[str]:
     return [f"* {head}: " + (f"`{text}`" if head == "Command" else markdown_escape(text)) for head, _, text in heads]
 
 
-def _printed(table: RecordTable) -> list[tuple[list[str], list[str], list[bool]]]:
-    """Labels, texts and marks of the best of every row."""
-    found = []
+def _printed(table: RecordTable, escape: Callable[[str], str], bold: str) -> list[list[str]]:
+    """Headings, then labels and figures of every row, escaped; ``bold`` formats the best figures."""
+    lines = [[escape(text) for text in (*table.stub, *(column.label for column in table.columns))]]
     for row in table.rows:
         group = row.label[: table.groups]
         rivals = [other for other in table.rows if other.label[: table.groups] == group and not other.reference]
-        texts = [_text(cell, column) for cell, column in zip(row.cells, table.columns, strict=True)]
-        marks = [
-            not row.reference and _is_best(row.cells[i], [other.cells[i] for other in rivals], column)
-            for i, column in enumerate(table.columns)
-        ]
-        found.append((row.label, texts, marks))
-    return found
+        line = [escape(text) for text in row.label]
+        for i, (own, column) in enumerate(zip(row.cells, table.columns, strict=True)):
+            best = not row.reference and _is_best(own, [other.cells[i] for other in rivals], column)
+            line.append((bold if best else "{}").format(escape(_text(own, column.digits))))
+        lines.append(line)
+    return lines
 
 
 def _is_best(cell: Cell, rivals: Sequence[Cell], column: Column) -> bool:
@@ -172,19 +155,17 @@ def _is_best(cell: Cell, rivals: Sequence[Cell], column: Column) -> bool:
     return merit(round(own, digits)) == min(map(merit, values))
 
 
-def _text(cell: Cell, column: Column) -> str:
-    if cell is None:
-        return ""
-    if isinstance(cell, str):
-        return cell
+def _text(cell: Cell, digits: int | None) -> str:
+    if cell is None or isinstance(cell, str):
+        return cell or ""
     if not isinstance(cell, Figure):
-        return _number(cell, column.digits)
+        return _number(cell, digits)
     if cell.seed_std is None and len(cell.seeds) > 1:
-        text = ", ".join(_number(value, column.digits) for value in cell.seeds)
+        text = ", ".join(_number(value, digits) for value in cell.seeds)
     else:
-        spread = "" if cell.seed_std is None else f" ± {_printed_number(cell.seed_std, column.digits)}"
-        text = _number(cell.mean, column.digits) + spread
-    return text if cell.std is None else f"{text} (± {_printed_number(cell.std, column.digits)})"
+        spread = "" if cell.seed_std is None else f" ± {_printed_number(cell.seed_std, digits)}"
+        text = _number(cell.mean, digits) + spread
+    return text if cell.std is None else f"{text} (± {_printed_number(cell.std, digits)})"
 
 
 def _number(value: float, digits: int | None) -> str:
@@ -196,7 +177,3 @@ def _printed_number(value: float, digits: int | None) -> str:
     """A number without a zero before the point."""
     text = f"{value:,.{digits}f}" if digits is not None else f"{value:,.10g}"
     return re.sub(r"^(-?)0\.", r"\1.", text)
-
-
-def _label(key: str) -> str:
-    return re.sub(r"[^A-Za-z0-9]+", "-", key)

@@ -14,6 +14,7 @@ that share their first ``groups`` labels is printed bold.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -102,27 +103,11 @@ class Record(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def save_record(path: Path, record: Record) -> None:
-    """Writes a record, one row of a table per line."""
+    """Writes a record, one row or column of a table per line."""
     text = msgspec.json.format(msgspec.json.encode(record), indent=1).decode()
-    write_durably(path, (_rows_on_lines(text) + "\n").encode())
-
-
-def _rows_on_lines(text: str) -> str:
-    """Joins the lines of each innermost object that is a row or a column."""
-    lines: list[str] = []
-    joining = ""
-    for line in text.splitlines():
-        depth = len(line) - len(line.lstrip())
-        if depth == 4 and line.strip() == "{":
-            joining = line
-        elif joining:
-            joining += line.strip() + (" " if line.endswith(",") else "")
-            if depth == 4:
-                lines.append(joining.rstrip())
-                joining = ""
-        else:
-            lines.append(line)
-    return "\n".join(lines)
+    # Rows and columns are the objects at depth 4; what is in them is deeper.
+    text = re.sub(r"(,?)\n(?: {5,}| {4}(?=}))", lambda end: ", " if end[1] else "", text)
+    write_durably(path, (text + "\n").encode())
 
 
 def load_record(path: Path) -> Record:

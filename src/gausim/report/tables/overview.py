@@ -8,8 +8,8 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather import paper
-from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, effect, families, number
+from gausim.report.gather.runs import RunRecord
+from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, effect, families, known, number
 from gausim.report.tables.motion import bounce_sheets, diagnosis_sheets, horizon_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
@@ -23,16 +23,15 @@ from gausim.report.tables.sheets import (
     Entry,
     Line,
     Sheet,
-    best_of,
-    entry,
     metric_sheet,
     plain,
+    rival_entries,
     seeds_entry,
     split_title,
 )
 from gausim.results.curves import ERROR_3D
-from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import footnotes_of, plus_minus
+from gausim.results.summary import MOTION_ENERGY, dig
+from gausim.results.table import CONTRAST_HEAD, contrast_texts, footnotes_of, plus_minus
 
 # (metric, views) in which ablations are compared.
 _ABLATED = (
@@ -72,10 +71,9 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
             cells = [cell(g, name, split, views, metric) for g in groups]
             if not any(c.value for c in cells):
                 continue
-            best = best_of(cells, metric, info)
-            where = {"points": ", 3D" if metric == MOTION_ENERGY else "", "train": ", images"}[views]
-            label = f"{info['label']}{where if metric == MOTION_ENERGY else ''}: {split_title(study, name, split)}"
-            lines.append(Line(label, METHOD, tuple(entry(c, info, best=i in best) for i, c in enumerate(cells))))
+            where = {"points": ", 3D", "train": ", images"}[views] if metric == MOTION_ENERGY else ""
+            label = f"{info['label']}{where}: {split_title(study, name, split)}"
+            lines.append(Line(label, METHOD, rival_entries(cells, metric, info)))
             if metric == "l2" and split != "seen" and groups[0].variation == FULL:
                 lines.append(_against_full(cells, split_title(study, name, split)))
     lines += _paper_ablation(name, groups, splits, study)
@@ -83,33 +81,33 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
         "Rows are scaled as in the other tables. Against full: change of the mean; in brackets, in standard deviations "
         "of the difference over seeds, where both have several."
     )
-    heads = ((f"{family}", tuple(g.variation for g in groups)),)
-    return Sheet(
-        f"ablation_{name}_{family}", ABLATIONS, f"Ablations of {family} on {name}", caption, heads, tuple(lines)
-    )
+    heads = ((family, tuple(g.variation for g in groups)),)
+    title = f"Ablations of {family} on {name}"
+    return Sheet(f"ablation_{name}_{family}", ABLATIONS, title, caption, heads, tuple(lines))
 
 
 def _against_full(cells: Sequence[Cell], title: str) -> Line:
     """Relative change of the error against the first column."""
-    entries = [plain("")]
-    for c in cells[1:]:
-        found = effect(cells[0].value, c.value)
-        if found is None:
-            entries.append(plain(""))
-            continue
-        extra = "" if found[1] is None else f"{found[1]:+.1f} σ"
-        entries.append(Entry(f"{found[0]:+.1f} %", extra, runs=cells[0].runs + c.runs))
-    return Line(f"l2: {title}, against full", METHOD, tuple(entries))
+
+    def against(c: Cell) -> Entry:
+        change, spreads = effect(cells[0].value, c.value) or (None, None)
+        if change is None:
+            return plain("")
+        return plain(
+            f"{change:+.1f} %", f"{spreads:+.1f} σ" if spreads is not None else "", runs=cells[0].runs + c.runs
+        )
+
+    return Line(f"l2: {title}, against full", METHOD, (plain(""), *map(against, cells[1:])))
 
 
 def _paper_ablation(name: str, groups: Sequence[Group], splits: Sequence[str], study: Study) -> list[Line]:
     if paper.paper_object(name) != paper.ABLATION_OBJECT:
         return []
     lines = []
+    found = [paper.ABLATION.get(g.variation) for g in groups]
     for column, split in enumerate([splits[0], splits[-1]]):
-        found = [paper.ABLATION.get(g.variation) for g in groups]
-        entries = tuple(plain(plus_minus(*f[column]) if f else "") for f in found)
-        lines.append(Line(f"l2: {split_title(study, name, split)} (paper)", PAPER, entries))
+        told = tuple(plain(plus_minus(*f[column]) if f else "") for f in found)
+        lines.append(Line(f"l2: {split_title(study, name, split)} (paper)", PAPER, told))
     return lines
 
 
@@ -153,15 +151,15 @@ def _costs(group: Group, name: str) -> tuple[Entry, ...]:
     fits = [fit for _, e in entries if number(dig(fit := footnotes_of(e, group.method).get("fit"), "cpu_seconds"))]
     levels = dig(costs[0], "levels", "counts")
     predictions, kernels = (number(dig(costs[0], "levels", key)) for key in ("predictions", "kernels"))
-    wall, processor = _known(fits, "seconds"), _known(fits, "cpu_seconds")
+    wall, processor = known(fits, "seconds"), known(fits, "cpu_seconds")
     note = f"{fmean(wall) / 60:.1f} min of wall time" if wall else ""
-    held = max(_known(fits, "peak_bytes"), default=0.0)
+    held = max(known(fits, "peak_bytes"), default=0.0)
     return (
         plain(_arrows(levels) if isinstance(levels, list) else "", runs=runs),
         plain(f"{predictions / kernels:.3f}" if predictions is not None and kernels else "", runs=runs),
-        seeds_entry(_known(costs, "seconds_per_frame", "mean"), "{:.4f}",
-                    stds=_known(costs, "seconds_per_frame", "std"), runs=runs),
-        plain(f"{1e3 * fmean(drawing):.2f}" if (drawing := _known(costs, "seconds_per_image")) else "", runs=runs),
+        seeds_entry(known(costs, "seconds_per_frame", "mean"), "{:.4f}",
+                    stds=known(costs, "seconds_per_frame", "std"), runs=runs),
+        plain(f"{1e3 * fmean(drawing):.2f}" if (drawing := known(costs, "seconds_per_image")) else "", runs=runs),
         plain(*_memory(costs), runs=runs),
         seeds_entry([seconds / 60 for seconds in processor], "{:.1f} min", note=note, runs=runs),
         plain(f"{held / _GIGA:.2f} GB" if held else "", runs=runs),
@@ -173,15 +171,10 @@ def _arrows(counts: Sequence[Any]) -> str:
     return " → ".join(map(str, counts))
 
 
-def _known(nodes: Sequence[Any], *keys: str) -> list[float]:
-    """The nodes' numbers under these keys."""
-    return [value for node in nodes if (value := number(dig(node, *keys))) is not None]
-
-
 def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
     """Main and small text of the memory: of a GPU the peak, of a process the increase by a prediction."""
     peak, added, first = (
-        max(_known(costs, "memory", f"{key}bytes"), default=None) for key in ("peak_", "added_", "first_added_")
+        max(known(costs, "memory", f"{key}bytes"), default=None) for key in ("peak_", "added_", "first_added_")
     )
     if peak is None or added is None:
         return "", ""
@@ -192,16 +185,14 @@ def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
     return f"+ {added / _MEGA:.1f} MB", f"first + {first / _MEGA:.0f} MB; process {peak / _GIGA:.2f} GB"
 
 
-_CONTRAST = ("mean foreground colour", "its norm", "largest l2 of a pixel")
-
-
 def contrast_sheet(study: Study) -> Sheet:
     """The paper's table of colour contrast, on which absolute errors of objects depend."""
     own = [_contrast(study, name) for name in study.objects]
-    theirs = [_printed(paper.CONTRAST.get(paper.paper_object(name) or "")) for name in study.objects]
-    lines = [Line(_CONTRAST[i], METHOD, tuple(column[i] for column in own)) for i in range(3)]
+    theirs = [_contrast_entries(paper.CONTRAST.get(paper.paper_object(name) or "")) for name in study.objects]
+    lines = [Line(head, METHOD, row) for head, row in zip(CONTRAST_HEAD, zip(*own, strict=True), strict=True)]
     if any(not e.missing for column in theirs for e in column):
-        lines += [Line(f"{_CONTRAST[i]} (paper)", PAPER, tuple(column[i] for column in theirs)) for i in range(3)]
+        printed = zip(CONTRAST_HEAD, zip(*theirs, strict=True), strict=True)
+        lines += [Line(f"{head} (paper)", PAPER, row) for head, row in printed]
     caption = (
         "Against the black background. Bright objects get larger absolute errors from the same displacement: compare "
         "errors between objects with this in mind. The largest l2 is that of the first run in this report."
@@ -213,13 +204,10 @@ def _contrast(study: Study, name: str) -> tuple[Entry, ...]:
     """The contrast of an object, from the first run that recorded one."""
     for run, found in (item for group in study.groups for item in group.entries(name)):
         if contrast := found.get("contrast"):
-            return _printed((contrast["mean_color"], contrast["norm"], contrast["max_l2"]), run)
-    return _printed(None)
+            return _contrast_entries((contrast["mean_color"], contrast["norm"], contrast["max_l2"]), run)
+    return _contrast_entries(None)
 
 
-def _printed(contrast: tuple[Sequence[float], float, float] | None, *runs: RunRecord) -> tuple[Entry, ...]:
-    if contrast is None:
-        return (plain(""),) * 3
-    color, norm, largest = contrast
-    texts = f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{largest:.2f}"
+def _contrast_entries(contrast: tuple[Sequence[float], float, float] | None, *runs: RunRecord) -> tuple[Entry, ...]:
+    texts = ("",) * 3 if contrast is None else contrast_texts(*contrast)
     return tuple(plain(text, runs=runs) for text in texts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -10,10 +9,10 @@ from typing import Any
 
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.gather import paper
-from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, deviation, pooled, says
+from gausim.report.gather.runs import RunRecord
+from gausim.report.gather.study import NOT_MEASURED, Cell, Study, cell, over_seeds, pooled, reference_rows, says
 from gausim.results.curves import CHAMFER, ERROR_3D, IOU, TRACK_ERROR
-from gausim.results.summary import MOTION_ENERGY
+from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import NO_FORESIGHT, plus_minus, spread
 
 METHOD, REFERENCE, PAPER = "method", "reference", "paper"
@@ -35,6 +34,7 @@ COST, CONTRAST = "Time and memory", "Colour contrast"
 SECTIONS = (ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, COST, CONTRAST)
 # LPIPS, for the table of the paper's figures when no run measured it.
 _LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
+_UNITS = {"1e-3": "×10⁻³", "1e-2": "×10⁻²", "1e-1": "×10⁻¹", "1e-3 scene units": "10⁻³ scene units"}
 NOTHING = "–"
 FLOOR = "reconstruction (floor)"
 OLD_EVALUATION = "Not measured: by an evaluation of an earlier version; call `gausim evaluate RUN` again."
@@ -95,11 +95,8 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     rows = [[cell(g, name, s, views, metric) for name, splits in columns for s in splits] for g in study.groups]
     if not any(c.value for row in rows for c in row) and (metric, views) != ("lpips", "train"):
         return None
-    best = [best_of([row[i] for row in rows], metric, info) for i in range(len(rows[0]))]
-    lines = [
-        Line(group.label, METHOD, tuple(entry(c, info, best=n in best[i]) for i, c in enumerate(row)))
-        for n, (group, row) in enumerate(zip(study.groups, rows, strict=True))
-    ]
+    shown = zip(*(rival_entries(column, metric, info) for column in zip(*rows, strict=True)), strict=True)
+    lines = [Line(group.label, METHOD, row) for group, row in zip(study.groups, shown, strict=True)]
     lines += _references(study, columns, metric, views, info)
     lines += _paper_lines(columns, metric, views)
     heads = tuple((name, tuple(split_title(study, name, s) for s in splits)) for name, splits in columns)
@@ -112,11 +109,8 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
 
 
 def _unit(info: dict[str, Any]) -> str:
-    unit = {"1e-3": "×10⁻³", "1e-2": "×10⁻²", "1e-1": "×10⁻¹", "1e-3 scene units": "10⁻³ scene units"}.get(
-        info["unit"], info["unit"]
-    )
-    arrow = {True: "↑", False: "↓"}.get(info["higher_is_better"], "")
-    return "".join(f" [{part}]" if i == 0 else f" {part}" for i, part in enumerate((unit, arrow)) if part)
+    unit = _UNITS.get(info["unit"], info["unit"])
+    return (f" [{unit}]" if unit else "") + {True: " ↑", False: " ↓"}.get(info["higher_is_better"], "")
 
 
 def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line]) -> str:
@@ -139,12 +133,23 @@ def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line
     return " ".join(parts)
 
 
-def entry(c: Cell, info: dict[str, Any], *, best: bool = False) -> Entry:
-    """A cell as a printed entry."""
+def rival_entries(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> tuple[Entry, ...]:
+    """Rival cells as printed entries, the best marked; none of a single one or without a better direction.
+
+    Cells are compared as they are printed.
+    """
+    better = info["higher_is_better"]
+    means = {i: round(c.value.mean * info["scale"], 2) for i, c in enumerate(cells) if c.value is not None}
+    merit = {i: abs(m - 1) if metric == MOTION_ENERGY else -m if better else m for i, m in means.items()}
+    is_race = len(means) > 1 and (better is not None or metric == MOTION_ENERGY)
+    return tuple(_entry(c, info, best=is_race and merit.get(i) == min(merit.values())) for i, c in enumerate(cells))
+
+
+def _entry(c: Cell, info: dict[str, Any], *, best: bool = False) -> Entry:
     if c.value is None:
         return Entry(c.status or NOTHING, missing=True, runs=c.runs)
     value, scale = c.value, info["scale"]
-    extra = [] if value.seed_std is None else [f"{spread(value.seed_std * scale)}, {value.seeds} seeds"]
+    extra = [] if value.seed_std is None else [f"{spread(value.seed_std * scale)}, {len(value.seeds)} seeds"]
     extra += ["unfinished"] if any(r.is_from_unfinished for r in c.runs) else []
     return Entry(plus_minus(value.mean, value.std, scale=scale), ", ".join(extra), best, runs=c.runs)
 
@@ -154,30 +159,17 @@ def seeds_entry(
     runs: tuple[RunRecord, ...] = (),
 ) -> Entry:  # fmt: skip
     """The mean of one figure per seed (and of ``stds``), followed in small by the spread of the seeds and ``note``."""
-    known = [value for value in values if value is not None and math.isfinite(value)]
-    if not known:
-        return Entry(NOTHING, missing=True, runs=runs)
-    text = " ± ".join(form.format(fmean(part)) for part in (known, stds) if part)
-    differ = deviation(known)
-    small = [] if differ is None else [f"± {form.format(differ)}, {len(known)} seeds"]
-    return Entry(text, "; ".join([*small, note] if note else small), runs=runs)
+    value = over_seeds(values)
+    if value is None:
+        return plain("", runs=runs)
+    text = " ± ".join(form.format(fmean(part)) for part in (value.seeds, stds) if part)
+    small = "" if value.seed_std is None else f"± {form.format(value.seed_std)}, {len(value.seeds)} seeds"
+    return plain(text, "; ".join(filter(None, (small, note))), runs=runs)
 
 
 def plain(text: str, extra: str = "", *, runs: tuple[RunRecord, ...] = ()) -> Entry:
     """An entry with a text; a missing entry if the text is empty."""
     return Entry(text or NOTHING, extra, missing=not text, runs=runs)
-
-
-def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int]:
-    """Rows with the best mean as printed; none for a single row or for a metric without a better direction."""
-    better = info["higher_is_better"]
-    if better is None and metric != MOTION_ENERGY:
-        return set()
-    means = {i: round(c.value.mean * info["scale"], 2) for i, c in enumerate(cells) if c.value is not None}
-    if len(means) < 2:
-        return set()
-    merit = {i: abs(m - 1) if metric == MOTION_ENERGY else -m if better else m for i, m in means.items()}
-    return {i for i, m in merit.items() if m == min(merit.values())}
 
 
 def _references(
@@ -187,30 +179,24 @@ def _references(
 
     The reconstruction's figure, in the column of seen frames, is the floor of any prediction.
     """
-    rows = dict.fromkeys(
-        row for g in study.groups for name in study.objects for _, e in g.entries(name)
-        for row in e["rows"] if row not in e["methods"]
-    )  # fmt: skip
-
     # References depend neither on the method nor on the seed: the first run that has one shows it.
     alone = {
         name: [replace(g, about={(name,): (run,)}) for g in study.groups for run, _ in g.entries(name)]
         for name, _ in columns
     }
 
-    def find(group: Group, name: str, split: str, row: str) -> Cell:
-        if row != FLOOR:
-            return cell(group, name, split, views, metric, row=row)
-        return pooled(group, name, lambda e: dig(e, "floor", metric), metric) if split == "seen" else Cell(None)
-
     def first(name: str, split: str, row: str) -> Cell:
-        return next((c for one in alone[name] if (c := find(one, name, split, row)).value), Cell(None))
+        if row == FLOOR and split != "seen":
+            return Cell(None)
+        keys = ("floor", metric) if row == FLOOR else ("rows", row, split, views, metric)
+        cells = (pooled(one, name, lambda e: dig(e, *keys), metric) for one in alone[name])
+        return next((c for c in cells if c.value), Cell(None))
 
     lines = []
-    for row in [*rows, *([FLOOR] if views == "train" else [])]:
+    for row in [*reference_rows(study.groups, study.objects), *([FLOOR] if views == "train" else [])]:
         cells = [first(name, split, row) for name, splits in columns for split in splits]
         if any(c.value for c in cells):
-            lines.append(Line(row, REFERENCE, tuple(entry(c, info) for c in cells)))
+            lines.append(Line(row, REFERENCE, tuple(_entry(c, info) for c in cells)))
     return lines
 
 
@@ -219,12 +205,10 @@ def _paper_lines(columns: Sequence[tuple[str, list[str]]], metric: str, views: s
     objects = [paper.paper_object(name) for name, _ in columns]
     lines = []
     for method, figures in table.items() if any(objects) else ():
-        entries = []
+        pairs = []
         for name, (_, splits) in zip(objects, columns, strict=True):
             seen, unseen = figures[name] if name else (None, None)
             late = "unseen_all" if name in paper.LATE and "unseen_all" in splits else "unseen"
-            for split in splits:
-                pair = {"seen": seen, late: unseen}.get(split)
-                entries.append(plain(plus_minus(*pair) if pair else ""))
-        lines.append(Line(method, PAPER, tuple(entries)))
+            pairs += [{"seen": seen, late: unseen}.get(split) for split in splits]
+        lines.append(Line(method, PAPER, tuple(plain(plus_minus(*pair) if pair else "") for pair in pairs)))
     return lines

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from gausim.report.gather.runs import dig
 from gausim.results.curves import BALLISTIC, ERROR_3D, FOLLOW_HANDS, STATIC
-from gausim.results.summary import MOTION_ENERGY
+from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import footnotes_of, reference_row
 
 # What the references predict, in words.
@@ -72,8 +71,8 @@ def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
     reference = reference_row(entries[0])
     unseen = entries[0]["splits"].get("unseen")
     split = "unseen" if unseen else "seen"
-    in_3d = [mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")]
-    measured, metric = ("points", ERROR_3D) if any(r is not None for r in in_3d) else ("train", "l2")
+    in_3d = {mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")} != {None}
+    measured, metric = ("points", ERROR_3D) if in_3d else ("train", "l2")
     return Outcome(
         frames=(unseen[0], unseen[1] - 1) if unseen else None,
         measured=measured,

@@ -17,8 +17,7 @@ from gausim.data.pretraining import BodyData
 from gausim.data.records import GroundTruth
 from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
-from gausim.report.gather.diagnosis import numbers, read_diagnosis
-from gausim.results.diagnosis import Diagnosis
+from gausim.results.diagnosis import Diagnosis, numbers, read_diagnosis
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data
