@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 
-from gausim.core import GaussianScene, SimState
+from gausim.core import GaussianScene, SimState, SteppedFrame
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -34,6 +34,13 @@ def _interaction(*, seed: int = 0, ceiling: float | None = None, **options: obje
     made_with = MadeWith.of(scene, model, initial, run="toy")
     units = model.units_of_kernels(0)
     return Interaction(scene, dynamics, dynamics.masses, initial, made_with=made_with, units=units, **options)
+
+
+def steps(interaction: Interaction, count: int) -> SteppedFrame:
+    """Takes some steps, at least one; the last frame."""
+    for _ in range(count):
+        frame = interaction.step()
+    return frame
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.column import steps
 
 from gausim.core import ConfigError, HandPath
 from gausim.interaction.hands import MovedHands
@@ -15,7 +16,6 @@ from gausim.interaction.session import Force, Hand
 from gausim.interaction.words import entry_of
 from gausim.ops.rotation import rotation_of
 
-pytest_plugins = ["helpers.column"]
 TO = (0.2, -0.1, 0.0)
 
 
@@ -24,18 +24,15 @@ def test_pins_go_where_the_hand_goes_and_the_body_follows(make_interaction) -> N
     scene = interaction.scene
     interaction.step()
     interaction.act(Hand(to=TO, frames=10))
-    for _ in range(10):
-        frame = interaction.step()
+    frame = steps(interaction, 10)
     torch.testing.assert_close(frame.positions[scene.pinned], scene.means[scene.pinned] + torch.tensor(TO))
     assert torch.equal(frame.positions[~scene.simulated], scene.means[~scene.simulated])
-    for _ in range(60):
-        frame = interaction.step()
+    frame = steps(interaction, 60)
     free = scene.simulated & ~scene.pinned
     away = (frame.positions - scene.means - torch.tensor(TO))[free].norm(dim=1).mean()
     assert away < 0.1 * torch.tensor(TO).norm()
     interaction.act(Hand(to=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.3), frames=20))
-    for _ in range(25):
-        frame = interaction.step()
+    frame = steps(interaction, 25)
     assert (frame.positions - scene.means)[free].norm(dim=1).max() > 0.02
 
 
@@ -74,8 +71,7 @@ def test_a_session_follows_recorded_hands_until_the_user_takes_over(make_interac
         frame = interaction.step()
         torch.testing.assert_close(frame.positions[pinned], before[pinned], atol=1e-5, rtol=0)
     interaction.act(Hand(to=TO, frames=3))
-    for _ in range(3):
-        frame = interaction.step()
+    frame = steps(interaction, 3)
     torch.testing.assert_close(frame.positions[pinned], rest[pinned] + torch.tensor(TO))
     session, last = interaction.session(), frame.positions
     assert torch.equal(replay(make_interaction(hands=path.pose), session).positions[-1], last)

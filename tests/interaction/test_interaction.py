@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.column import steps
 from msgspec.structs import replace as changed
 
 from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
@@ -134,8 +135,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
         return live.frame.positions - scene.means
 
     live.act(Force(Whole(), (0.0, 3.0, 4.0), 1.5, frames=2))
-    for _ in range(3):
-        live.step()
+    steps(live, 3)
     a = 1.5 * 2.0 * torch.tensor([0.0, 0.6, 0.8])
     # after steps 1, 2 (pushed) and 3 (free): a dt^2 (1 + 2 + 2)
     assert torch.allclose(shift()[free], (5 * a * dt**2).expand(int(free.sum()), 3), rtol=1e-3, atol=1e-6)
@@ -143,8 +143,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
 
     live.reset()
     live.act(Impulse(Whole(), X, 0.1))
-    for _ in range(4):
-        live.step()
+    steps(live, 4)
     assert torch.allclose(shift()[free][:, 0], torch.tensor(4 * 0.1 * 2.0 * dt), rtol=1e-3)
 
     live.reset()
@@ -180,8 +179,7 @@ def test_pinned_kernels_never_move(make_interaction) -> None:
     live = make_interaction(keep=4)
     pinned, held = live.scene.pinned | ~live.scene.simulated, Kernels(tuple(range(70, 80)))
     live.act(Gravity(X, 1.0))
-    for _ in range(4):
-        live.step()
+    steps(live, 4)
     kept = live.trajectory()  # the latest frames only
     assert kept.frames == 4 and torch.equal(kept.positions[-1], live.frame.positions)
     live.act(Pin(held))
@@ -222,11 +220,9 @@ def test_it_says_that_forces_act_in_part(make_interaction) -> None:
     live.step()
     assert live.limited == 0 and not live.resisting
     live.act(Force(Whole(), (1.0, 0.0, 0.0), 10.0, frames=8))
-    for _ in range(8):
-        live.step()
+    steps(live, 8)
     assert 0 < live.limited <= 8 and live.resisting
-    for _ in range(24):
-        live.step()
+    steps(live, 24)
     live.reset()
     assert live.limited == 0 and not live.resisting
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.plain import cameras_at, plain_scene
+from torch import Tensor
 
 from gausim.cli.main import main
 from gausim.core import Cameras, ConfigError, DataError, GaussianScene
@@ -23,11 +25,12 @@ from gausim.reconstruction.reconstruction import ROUNDS, Reconstruction, Reconst
 from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.state import Partial, identity
-from gausim.reconstruction.stills import ImageSet, draw_rest, measure, reduced
+from gausim.reconstruction.stills import ImageSet, measure, reduced
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import draw
+from gausim.render.draw import draw_still
 
 SIZE = 40
+RENDERER = CpuRenderer(threads=1)
 TINY = ReconstructionOptions(kernels=160, iterations=400, hull_resolution=24, rates=LearningRates(means=1e-3))
 
 
@@ -53,8 +56,7 @@ def true_scene() -> GaussianScene:
 def stills() -> ImageSet:
     """Straight-alpha stills of the true scene."""
     scene, cameras = true_scene(), cameras_around(24)
-    identity, unit = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.int64)
-    drawn = draw(CpuRenderer(threads=1), scene, scene.means[None], identity, identity, unit, cameras)
+    drawn = draw_still(RENDERER, scene, cameras)
     rgb, alpha = drawn.rgb[0], drawn.alpha[0][..., None]
     alpha = torch.where(alpha < 0.02, 0.0, alpha)
     rgba = torch.cat((rgb / alpha.clamp_min(0.02), alpha), -1).clamp(0, 1)
@@ -63,13 +65,13 @@ def stills() -> ImageSet:
 
 @pytest.fixture(scope="module")
 def fitted(stills: ImageSet) -> GaussianScene:
-    return reconstruct([stills.select(range(20))], CpuRenderer(threads=1), TINY, name="balls")
+    return reconstruct([stills.select(range(20))], RENDERER, TINY, name="balls")
 
 
 def test_stills_left_out_are_met(stills: ImageSet, fitted: GaussianScene) -> None:
-    left_out, renderer = stills.select(range(20, 24)), CpuRenderer(threads=1)
-    start = reconstruct([stills.select(range(20))], renderer, ReconstructionOptions(kernels=160, iterations=1))
-    before, after = measure(start, renderer, left_out), measure(fitted, renderer, left_out)
+    left_out = stills.select(range(20, 24))
+    start = reconstruct([stills.select(range(20))], RENDERER, ReconstructionOptions(kernels=160, iterations=1))
+    before, after = measure(start, RENDERER, left_out), measure(fitted, RENDERER, left_out)
     assert after["psnr"] > 28 and after["psnr"] > before["psnr"] + 5
     assert after["psnr_foreground"] > 24
     assert after["ssim"] > before["ssim"]
@@ -90,7 +92,7 @@ def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) ->
 def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
     options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16)
     points = true_scene().means[::2]
-    scene = reconstruct([stills], CpuRenderer(threads=1), options, cloud=PointCloud(points))
+    scene = reconstruct([stills], RENDERER, options, cloud=PointCloud(points))
     assert torch.cdist(scene.means, points).amin(1).max() < 0.02
 
 
@@ -98,10 +100,10 @@ def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
     images = stills.images.clone()
     images[3, ..., 3] = 0
     with pytest.raises(DataError, match="visual hull of 24 masks is empty"):
-        reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), TINY)
+        reconstruct([ImageSet("stills", images, stills.cameras)], RENDERER, TINY)
     allowed = replace(TINY, missing_masks=0.05, iterations=1)
-    scene = reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), allowed)
-    whole = reconstruct([stills], CpuRenderer(threads=1), allowed)
+    scene = reconstruct([ImageSet("stills", images, stills.cameras)], RENDERER, allowed)
+    whole = reconstruct([stills], RENDERER, allowed)
     assert scene.count > 50
     assert (scene.means.amin(0) - whole.means.amin(0)).abs().max() < 0.1
 
@@ -125,25 +127,25 @@ def shell() -> PointCloud:
 
 def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ROUNDS, "scene", 6)  # more would need more steps
-    photos, renderer = walled(stills), CpuRenderer(threads=1)
+    photos = walled(stills)
     options = ReconstructionOptions(
         kernels=1000, iterations=250, extent="scene", minimum_opacity=0.01, anisotropy_limit=10.0
     )
     train, left_out = photos.select(range(20)), photos.select(range(20, 24))
-    scene = reconstruct([train], renderer, options, cloud=shell())
-    figures = measure(scene, renderer, left_out)
+    scene = reconstruct([train], RENDERER, options, cloud=shell())
+    figures = measure(scene, RENDERER, left_out)
     assert 775 < scene.count <= 1000
     assert figures["psnr"] > 28 and figures["psnr"] == pytest.approx(figures["psnr_foreground"])
     assert (scene.means.norm(dim=-1) > 3).any()  # what lies behind is there too
     with pytest.raises(ConfigError, match="starts from points"):
-        reconstruct([train], renderer, options)
+        reconstruct([train], RENDERER, options)
     with pytest.raises(DataError, match="need colours"):
-        reconstruct([train], renderer, options, cloud=PointCloud(shell().points))
+        reconstruct([train], RENDERER, options, cloud=PointCloud(shell().points))
 
 
 def test_error_is_attributed_to_the_kernels_under_it(stills: ImageSet) -> None:
     """Against the sum over pixels of the kernel's weight times the error, its weight found by drawing it alone."""
-    run = Reconstruction([stills], CpuRenderer(threads=1), TINY, cloud=None, name="balls")
+    run = Reconstruction([stills], RENDERER, TINY, cloud=None, name="balls")
     error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
     error[18:22, 18:22] = 0.5
     drawable = run.splats.drawable(stills.cameras.centers[0])
@@ -159,7 +161,7 @@ def test_error_is_attributed_to_the_kernels_under_it(stills: ImageSet) -> None:
 
 def test_an_interrupted_reconstruction_goes_on_bit_by_bit(stills: ImageSet, tmp_path: Path) -> None:
     options = ReconstructionOptions(kernels=60, iterations=30, hull_resolution=16)
-    whole = reconstruct([stills], CpuRenderer(threads=1), options)
+    whole = reconstruct([stills], RENDERER, options)
     partial = Partial(tmp_path / "scene.ply", identity([stills], options, None))
     assert partial.read() is None
 
@@ -169,10 +171,10 @@ def test_an_interrupted_reconstruction_goes_on_bit_by_bit(stills: ImageSet, tmp_
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct([stills], CpuRenderer(threads=1), options, progress=stop_at_half)
+        reconstruct([stills], RENDERER, options, progress=stop_at_half)
     begun = partial.read()
     assert begun is not None and int(begun["done"]) == 17
-    scene = reconstruct([stills], CpuRenderer(threads=1), options, begun=begun)
+    scene = reconstruct([stills], RENDERER, options, begun=begun)
     for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
         assert torch.equal(getattr(scene, name), getattr(whole, name)), name
     for other in (replace(options, seed=1), replace(options, kernels=61)):
@@ -188,7 +190,7 @@ def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
     still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
     options = replace(TINY, iterations=100, patience=2, rates=still, random_background=False)
     steps: list[int] = []
-    reconstruct([stills.select([0])], CpuRenderer(threads=1), options, progress=lambda run: steps.append(run.done))
+    reconstruct([stills.select([0])], RENDERER, options, progress=lambda run: steps.append(run.done))
     assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
 
 
@@ -199,14 +201,16 @@ def test_options_out_of_range_are_refused(change: dict[str, Any]) -> None:
 
 
 def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
-    half = reduced(stills, (SIZE // 2, SIZE // 2), weight=0.3)
+    half = reduced(replace(stills, weight=0.3), 0.5)
     assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.weight == 0.3
-    renderer, scene = CpuRenderer(threads=1), true_scene()
-    large = draw_rest(scene, renderer, stills.cameras).reshape(24, SIZE // 2, 2, SIZE // 2, 2, 3).mean((2, 4))
+    large, small = (
+        draw_still(RENDERER, true_scene(), cameras).rgb[0].clamp(0, 1) for cameras in (stills.cameras, half.cameras)
+    )
+    large = large.reshape(24, SIZE // 2, 2, SIZE // 2, 2, 3).mean((2, 4))
     alpha = half.images[..., 3:].float() / 255
     assert (half.images[..., :3].float() / 255 * alpha - large).abs().max() < 0.02
     # The pixel filter is the same in pixels, so the small rendering is softer; a wrong K would give 0.1 and more.
-    assert (draw_rest(scene, renderer, half.cameras) - large).abs().mean() < 0.04
+    assert (small - large).abs().mean() < 0.04
 
 
 def test_split_and_keep_carry_parameters_and_moments() -> None:
@@ -243,51 +247,49 @@ def test_split_and_keep_carry_parameters_and_moments() -> None:
     assert not torch.equal(splats["means"].detach()[0], before[1])
 
 
-def test_command_writes_scene_masks_figures_and_picture(
-    stills: ImageSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "images").mkdir()
-    for i, image in enumerate(stills.images):
-        write_rgba(tmp_path / "images" / f"{i:02d}.png", image)
-    entries = [{"file_path": f"images/{i:02d}.png"} for i in range(24)]
-    write_transforms(tmp_path / "transforms.json", stills.cameras, entries)
-    command = ["reconstruct", "--transforms", str(tmp_path / "transforms.json")]
-    command += ["--out", str(tmp_path / "out" / "s.ply")]
-    assert main([*command, "--kernels", "80", "--iterations", "40", "--pin-below", "z=-0.2"]) == 0
-    scene = load_scene(tmp_path / "out" / "s.ply")
+def written(images: ImageSet, folder: Path, write: Callable[[Path, Tensor], object]) -> list[str]:
+    """Writes images with their poses; the beginning of a command that reconstructs them."""
+    names = [f"images/{i:02d}.png" for i in range(len(images.images))]
+    (folder / "images").mkdir()
+    for name, image in zip(names, images.images, strict=True):
+        write(folder / name, image)
+    write_transforms(folder / "transforms.json", images.cameras, [{"file_path": name} for name in names])
+    return ["reconstruct", "--transforms", str(folder / "transforms.json")]
+
+
+def test_command_writes_scene_masks_figures_and_picture(stills: ImageSet, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out" / "s.ply"
+    command = [*written(stills, tmp_path, write_rgba), "--out", str(out), "--kernels", "80"]
+    assert main([*command, "--iterations", "40", "--pin-below", "z=-0.2"]) == 0
+    scene = load_scene(out)
     assert torch.equal(scene.pinned, scene.means[:, 2] < -0.2) and scene.pinned.any()
-    record = json.loads((tmp_path / "out" / "s.json").read_text())
+    record = json.loads(out.with_suffix(".json").read_text())
     assert record["measured"]["stills left out"]["images"] == 2
     assert record["kernels"] == scene.count and record["options"]["iterations"] == 40
-    assert (tmp_path / "out" / "s.png").stat().st_size > 1000
+    assert out.with_suffix(".png").stat().st_size > 1000
     assert "stills left out" in capsys.readouterr().out
-    assert main([*command, "--kernels", "80", "--iterations", "20", "--pin-below", "z=-9"]) == 2
+    assert main([*command, "--iterations", "20", "--pin-below", "z=-9"]) == 2
     assert "holds none of" in capsys.readouterr().err
 
 
-def test_command_takes_photos_without_masks_as_a_scene(
-    stills: ImageSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "images").mkdir()
-    for i, image in enumerate(walled(stills).images):
-        bgr = np.ascontiguousarray(image[..., :3].flip(-1).numpy())
-        assert cv2.imwrite(str(tmp_path / "images" / f"{i:02d}.png"), bgr)
-    write_transforms(
-        tmp_path / "transforms.json", stills.cameras, [{"file_path": f"images/{i:02d}.png"} for i in range(24)]
-    )
-    command = ["reconstruct", "--transforms", str(tmp_path / "transforms.json"), "--iterations", "30"]
-    assert main([*command]) == 2
+def test_command_takes_photos_without_masks_as_a_scene(stills: ImageSet, tmp_path: Path, capsys) -> None:
+    def without_alpha(path: Path, image: Tensor) -> None:
+        assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., :3].flip(-1).numpy()))
+
+    command = [*written(walled(stills), tmp_path, without_alpha), "--iterations", "30"]
+    assert main(command) == 2
     assert "got 40x40 RGB" in capsys.readouterr().err
-    assert main([*command, "--extent", "scene"]) == 2
+    command += ["--extent", "scene"]
+    assert main(command) == 2
     assert "starts from points" in capsys.readouterr().err
     points, colors = shell().points.numpy(), (255 * shell().colors).to(torch.uint8).numpy()
     np.savez(tmp_path / "points.npz", points=points, colors=colors)
-    assert main([*command, "--extent", "scene", "--leave-out", "12", "--longest", "30", "--kernels", "900"]) == 0
+    assert main([*command, "--leave-out", "12", "--longest", "30", "--kernels", "900"]) == 0
     measured = json.loads((tmp_path / "scene.json").read_text())["measured"]
     assert measured["stills left out"]["images"] == 2 and measured["stills to train on"]["images"] == 22
     assert not list(tmp_path.glob(".*"))
     np.savez(tmp_path / "points.npz", points=points, colors=colors[:3])
-    assert main([*command, "--extent", "scene"]) == 2
+    assert main(command) == 2
     assert "'colors' must be (775, 3)" in capsys.readouterr().err
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, GaussianScene, Rendered, Renderer
 from gausim.ops.covariance import covariance_from_scales
+from gausim.ops.rotation import rotation_of
 
 
 @dataclass
@@ -32,9 +33,9 @@ class Inputs:
     def tensors(self) -> tuple[Tensor, ...]:
         return self.means, self.covars, self.colors, self.opacities, self.background
 
-    def to(self, dtype: torch.dtype) -> Inputs:
+    def to(self, *kind: torch.dtype | str) -> Inputs:
         names = ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background")
-        return replace(self, **{name: getattr(self, name).detach().to(dtype).clone() for name in names})
+        return replace(self, **{name: getattr(self, name).detach().to(*kind).clone() for name in names})
 
     def draw(self, renderer: Renderer) -> Rendered:
         given = *self.tensors[:4], self.viewmats, self.Ks, self.size
@@ -44,25 +45,31 @@ class Inputs:
         """Images and the gradients of a fixed random function of them."""
         leaves = [x.requires_grad_() for x in self.tensors]
         images = self.draw(renderer)
-        generator = torch.Generator().manual_seed(5)
-        weight_rgb = torch.randn(images.rgb.shape, generator=generator).to(images.rgb)
-        weight_alpha = torch.randn(images.alpha.shape, generator=generator).to(images.rgb)
-        loss = (images.rgb * weight_rgb).sum() + (images.alpha * weight_alpha).sum()
-        if images.depth is not None:
-            loss = loss + (images.depth * torch.randn(images.depth.shape, generator=generator).to(images.rgb)).sum()
+        g = torch.Generator().manual_seed(5)
+        planes = [x for x in (images.rgb, images.alpha, images.depth) if x is not None]
+        loss = sum((x * torch.randn(x.shape, generator=g).to(x)).sum() for x in planes)
         return images, list(torch.autograd.grad(loss, leaves))
 
 
 def orbit(views: int, distance: float = 2.5) -> Tensor:
     """World-to-camera matrices around the origin, (V, 4, 4) in float64."""
     viewmats = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
-    for v in range(views):
-        a, b = 0.7 * v, 0.3 * v
-        yaw = [[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]]
-        pitch = [[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]]
-        viewmats[v, :3, :3] = torch.tensor(pitch, dtype=torch.float64) @ torch.tensor(yaw, dtype=torch.float64)
-        viewmats[v, 2, 3] = distance
+    for v, viewmat in enumerate(viewmats):
+        pitch, yaw = rotation_of(torch.tensor([[0.3 * v, 0, 0], [0, 0.7 * v, 0]], dtype=torch.float64))
+        viewmat[:3, :3], viewmat[2, 3] = pitch @ yaw, distance
     return viewmats
+
+
+# Arguments of make_inputs that strain a renderer in different ways.
+CASES = {
+    "usual": dict(states=2, views=3, count=300, size=(66, 50)),
+    "two_bands": dict(states=2, views=2, count=200, size=(45, 70)),
+    "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
+    "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
+    "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
+    "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
+    "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
+}
 
 
 def make_inputs(
@@ -99,6 +106,18 @@ def make_inputs(
 def inputs() -> Callable[..., Inputs]:
     """Makes random arguments of a renderer."""
     return make_inputs
+
+
+@pytest.fixture
+def case() -> Callable[[str, bool], Inputs]:
+    """Makes the arguments of one of the :data:`CASES`, with or without depth."""
+
+    def make(name: str, depth: bool) -> Inputs:
+        given = replace(make_inputs(**CASES[name]), depth=depth)
+        given.opacities[:, 1::9] = 1e-3  # below 1/255
+        return given
+
+    return make
 
 
 @pytest.fixture

@@ -49,9 +49,7 @@ def test_options_reach_the_renderers(inputs: Callable) -> None:
 
 
 @pytest.mark.parametrize(("reason", "choice"), [(None, "gsplat"), (REASON, "cpu")])
-def test_on_cuda_it_is_gsplat_or_says_why_not(
-    reason: str | None, choice: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_on_cuda_it_is_gsplat_or_says_why_not(reason, choice, monkeypatch, caplog) -> None:
     asked = []
     monkeypatch.setattr(auto.gsplat, "unavailable", lambda: asked.append(1) or reason)
     assert [chosen("cuda"), chosen("cuda")] == [choice, choice]
@@ -63,15 +61,11 @@ def test_on_cuda_it_is_gsplat_or_says_why_not(
 
 
 @pytest.mark.gpu
-def test_gpu_tensors_without_gsplat_are_drawn_on_the_cpu_and_return(
-    inputs: Callable, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpu_tensors_without_gsplat_are_drawn_on_the_cpu_and_return(inputs, monkeypatch) -> None:
     monkeypatch.setattr(auto.gsplat, "unavailable", lambda: REASON)
     given = inputs(2, 2, 80, (34, 22)).to(torch.float32)
     expected, expected_gradients = given.draw_with_gradients(CpuRenderer())
-    for name in ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background"):
-        setattr(given, name, getattr(given, name).detach().cuda())
-    images, deformation_gradients = given.draw_with_gradients(AutoRenderer())
+    images, deformation_gradients = given.to("cuda").draw_with_gradients(AutoRenderer())
     assert images.rgb.device.type == "cuda" and torch.equal(images.rgb.cpu(), expected.rgb)
     for value, truth in zip(deformation_gradients, expected_gradients, strict=True):
         assert value.device.type == "cuda"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
@@ -13,24 +12,13 @@ from gausim.core import ConfigError, DivergenceError
 from gausim.render.cpu import CpuRenderer
 from gausim.render.reference import ReferenceRenderer
 
-CASES = {
-    "usual": dict(states=2, views=3, count=300, size=(66, 50)),
-    "two_bands": dict(states=2, views=2, count=200, size=(45, 70)),
-    "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
-    "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
-    "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
-    "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
-    "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
-}
-
-
+CASES = ["usual", "two_bands", "dense", "big", "tiny", "around_the_camera", "off_screen"]
 NAMES = ("means", "covars", "colors", "opacities", "background")
 
 
-@pytest.mark.parametrize(("case", "depth"), [("usual", False), *((case, True) for case in CASES)])
-def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, depth: bool) -> None:
-    given = replace(inputs(**CASES[case]), depth=depth)
-    given.opacities[:, 1::9] = 1e-3  # below 1/255
+@pytest.mark.parametrize(("name", "depth"), [("usual", False), *((name, True) for name in CASES)])
+def test_image_and_gradients_equal_the_reference(case: Callable, name: str, depth: bool) -> None:
+    given = case(name, depth)
     images, deformation_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=2))
     expected, expected_gradients = given.to(torch.float64).draw_with_gradients(ReferenceRenderer())
     assert float(expected.alpha.detach().max()) > 0.1
@@ -40,8 +28,8 @@ def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, de
     if images.depth is not None and expected.depth is not None:
         assert float(expected.depth.detach().max()) > 0.1
         torch.testing.assert_close(images.depth.double(), expected.depth, atol=3e-5, rtol=0)
-    for name, value, truth in zip(NAMES, deformation_gradients, expected_gradients, strict=True):
-        assert float((value - truth).norm() / truth.norm()) < 1e-4, name
+    for of, value, truth in zip(NAMES, deformation_gradients, expected_gradients, strict=True):
+        assert float((value - truth).norm() / truth.norm()) < 1e-4, of
 
 
 def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callable) -> None:

@@ -10,12 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.core import Cameras, ConfigError, GaussianScene, Trajectory
+from gausim.core import Cameras, ConfigError, Rendered, Trajectory
 from gausim.ops.quaternion import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import evaluate_sh
-from gausim.render import SceneAppearance, draw, draw_trajectory, film
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import deformed_appearance
+from gausim.render.draw import SceneAppearance, deformed_appearance, draw, film
 from gausim.render.reference import ReferenceRenderer
 
 COUNT, UNITS = 12, 3
@@ -35,10 +34,8 @@ def deformation(states: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_rotating_scene_and_cameras_together_changes_nothing(
-    scene: Callable, cameras: Cameras, units: Tensor, degree: int
-) -> None:
-    still: GaussianScene = scene(COUNT, degree)
+def test_rotating_scene_and_cameras_together_changes_nothing(scene, cameras, units, degree) -> None:
+    still = scene(COUNT, degree)
     rest = still.means.expand(2, -1, -1)
     identity = torch.eye(3).double().expand(2, UNITS, 3, 3)
     expected = draw(ReferenceRenderer(), still, rest, identity, identity, units, cameras)
@@ -57,9 +54,7 @@ def test_rotating_scene_and_cameras_together_changes_nothing(
 
 
 @pytest.mark.parametrize("degree", [1, 3])
-def test_colours_are_looked_up_along_the_unrotated_direction(
-    scene: Callable, cameras: Cameras, units: Tensor, degree: int
-) -> None:
+def test_colours_are_looked_up_along_the_unrotated_direction(scene, cameras, units, degree) -> None:
     still = scene(COUNT, degree)
     positions = torch.randn(2, COUNT, 3, dtype=torch.float64)
     _, rotations = deformation(2)
@@ -87,28 +82,16 @@ def test_gradients_reach_positions_gradients_and_rotations(scene: Callable, came
 
 def test_mask_draws_the_kernels_it_names(scene: Callable, cameras: Cameras, units: Tensor) -> None:
     still = scene(COUNT, 2)
-    (deformation_gradients, rotations), positions = deformation(2), still.means.expand(2, -1, -1)
-    part = still.select(still.foreground)
-    expected = draw(
-        ReferenceRenderer(),
-        part,
-        positions[:, still.foreground],
-        deformation_gradients,
-        rotations,
-        units[still.foreground],
-        cameras,
-    )
-    images = draw(
-        ReferenceRenderer(), still, positions, deformation_gradients, rotations, units, cameras, mask=still.foreground
-    )
-    assert torch.equal(images.rgb, expected.rgb)
-    whole = draw(ReferenceRenderer(), still, positions, deformation_gradients, rotations, units, cameras)
-    assert float((whole.rgb - expected.rgb).abs().max()) > 1e-2
+    turns, positions, mask = deformation(2), still.means.expand(2, -1, -1), still.foreground
+
+    def image(look: object, positions: Tensor, units: Tensor, **options: Tensor) -> Tensor:
+        return draw(ReferenceRenderer(), look, positions, *turns, units, cameras, **options).rgb
+
+    expected = image(still.select(mask), positions[:, mask], units[mask])
+    assert torch.equal(image(still, positions, units, mask=mask), expected)
+    assert float((image(still, positions, units) - expected).abs().max()) > 1e-2
     with pytest.raises(ConfigError, match="SceneAppearance.of"):
-        draw(
-            ReferenceRenderer(), SceneAppearance.of(still), positions, deformation_gradients, rotations, units, cameras,
-            mask=still.foreground,
-        )  # fmt: skip
+        image(SceneAppearance.of(still), positions, units, mask=mask)
 
 
 def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, units: Tensor) -> None:
@@ -119,12 +102,14 @@ def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, u
     renderer = CpuRenderer(threads=1)
     behind = torch.tensor([1.0, 1.0, 1.0])
     expected = draw(renderer, still, positions, deformation_gradients, rotations, units, cameras, background=behind).rgb
-    parts = []
-    for part in draw_trajectory(renderer, still, trajectory, cameras, background=behind, chunk=2):
-        assert torch.is_grad_enabled()
-        parts.append(part.rgb)
-    assert [p.shape[0] for p in parts] == [2, 2, 1]
-    assert torch.equal(torch.cat(parts), expected)
+    drawn = []
+
+    def noted(means: Tensor, *inputs: object, **options: object) -> Rendered:
+        drawn.append(len(means))
+        return renderer(means, *inputs, **options)
+
+    exact = film(noted, still, trajectory, cameras, background=behind, as_bytes=False, chunk=2)
+    assert drawn == [2, 2, 1] and torch.equal(exact, expected)
     frames = film(renderer, still, trajectory, cameras, background=behind, chunk=3)
     assert frames.dtype == torch.uint8 and frames.shape == (5, 2, cameras.height, cameras.width, 3)
     assert float((frames.float() / 255 - expected.clamp(0, 1)).abs().max()) <= 0.5 / 255 + 1e-6

@@ -40,11 +40,19 @@ CAMERA = {
 }  # fmt: skip
 
 
+@contextlib.contextmanager
+def serving(access: Access) -> Iterator[GuardedServer]:
+    made = GuardedServer(access)
+    try:
+        yield made
+    finally:
+        made.stop()
+
+
 @pytest.fixture(scope="module")
 def server() -> Iterator[GuardedServer]:
-    made = GuardedServer(Access(port=0))
-    yield made
-    made.stop()
+    with serving(Access(port=0)) as made:
+        yield made
 
 
 def get(server: GuardedServer, path: str = "/", **headers: str) -> tuple[int, bytes, dict[str, str]]:
@@ -66,9 +74,9 @@ def dial(server: GuardedServer, origin: str | None = "", **headers: str) -> Clie
     )  # fmt: skip
 
 
-def alive(server: GuardedServer) -> bool:
+def alive(server: GuardedServer, **headers: str) -> bool:
     """Whether a new client is welcomed and told something."""
-    with dial(server) as client:
+    with dial(server, **headers) as client:
         client.send(msgspec.msgpack.encode(CAMERA))
         return len(client.recv(timeout=10)) > 0
 
@@ -205,16 +213,13 @@ def test_no_client_can_have_the_page_shared_or_upload_without_end(server: Guarde
 
 
 def test_more_clients_than_are_served_are_turned_away() -> None:
-    server = GuardedServer(Access(port=0))
-    try:
+    with serving(Access(port=0)) as server:
         clients = [dial(server) for _ in range(MOST_CLIENTS)]
         with pytest.raises(InvalidStatus, match="503"):
             dial(server)
         for client in clients:
             client.close()
         assert alive(server)
-    finally:
-        server.stop()
 
 
 def test_other_machines_are_let_in_only_by_flag_and_token() -> None:
@@ -222,8 +227,7 @@ def test_other_machines_are_let_in_only_by_flag_and_token() -> None:
         GuardedServer(Access(host="0.0.0.0", port=0))
     with pytest.raises(ConfigError, match="IP address"):
         GuardedServer(Access(host="example.org", port=0, remote=True))
-    server = GuardedServer(Access(host="0.0.0.0", port=0, remote=True))
-    try:
+    with serving(Access(host="0.0.0.0", port=0, remote=True)) as server:
         token = server.access.token
         assert token is not None and len(token) >= 32 and token in server.url
         assert get(server)[0] == 401
@@ -235,11 +239,7 @@ def test_other_machines_are_let_in_only_by_flag_and_token() -> None:
         assert get(server, Cookie=cookie)[0] == 200
         with pytest.raises(InvalidStatus, match="401"):
             dial(server)
-        with dial(server, Cookie=cookie) as client:
-            client.send(msgspec.msgpack.encode(CAMERA))
-            assert client.recv(timeout=10)
-    finally:
-        server.stop()
+        assert alive(server, Cookie=cookie)
 
 
 @pytest.mark.parametrize("token", ["short", "has spaces in its middle", "ümlaute" * 4])

@@ -73,6 +73,16 @@ def drag(viewer: Viewer, page: Page) -> tuple[torch.Tensor, tuple[float, float],
     return viewer.placing.to_scene(farthest), end, force
 
 
+def pause(viewer: Viewer, page: Page) -> None:
+    page.press_button("Pause")
+    page.wait(lambda: not viewer.live.playing, 10, "a pause")
+
+
+def reset(viewer: Viewer, page: Page) -> None:
+    page.press_button("Reset")
+    page.wait(lambda: viewer.live.interaction.frame_number == 0, 10, "a reset")
+
+
 def play(viewer: Viewer, page: Page) -> None:
     """Drags the part that is farthest from what is pinned to the right, saves, replays and resets."""
     pointer, live, interaction = viewer.pointer, viewer.live, viewer.live.interaction
@@ -94,8 +104,7 @@ def play(viewer: Viewer, page: Page) -> None:
     live.pace = 0.2
     page.release(*end)
     page.wait(lambda: not live.interaction.acting, 10, "letting go")
-    page.press_button("Pause")
-    page.wait(lambda: not live.playing, 10, "a pause")
+    pause(viewer, page)
     recorded = interaction.trajectory()
     page.press_button("Session")
     page.press_button("Save the session")
@@ -104,14 +113,11 @@ def play(viewer: Viewer, page: Page) -> None:
     for name in ("positions", "deformation_gradients", "rotations"):
         assert torch.equal(getattr(again, name), getattr(recorded, name)), name
     page.press_button("Play", "[role=tab]")
-    page.press_button("Reset")
-    page.wait(lambda: live.interaction.frame_number == 0, 10, "a reset")
+    reset(viewer, page)
     assert torch.equal(interaction.frame.positions, scene.means) and not live.message
 
 
-def test_page_pulls_where_the_mouse_goes_and_resets(
-    make_interaction: Callable[..., Interaction], tmp_path: Path
-) -> None:
+def test_page_pulls_where_the_mouse_goes_and_resets(make_interaction, tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(), sessions=tmp_path), tmp_path) as (viewer, page):
         live = viewer.live
         centre, end, force = drag(viewer, page)
@@ -121,10 +127,8 @@ def test_page_pulls_where_the_mouse_goes_and_resets(
         assert force.weights > 0 and pulled[0] > seen[0], "does not pull to the right on the screen"
         page.release(*end)
         page.wait(lambda: not live.interaction.acting, 10, "letting go")
-        page.press_button("Pause")
-        page.wait(lambda: not live.playing, 10, "a pause")
-        page.press_button("Reset")
-        page.wait(lambda: live.interaction.frame_number == 0, 10, "a reset")
+        pause(viewer, page)
+        reset(viewer, page)
 
 
 @pytest.mark.slow
@@ -182,8 +186,7 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
         assert not interaction.acting, "a flick pulls before it is released"
         page.release(*end, modifiers=CTRL)
         page.wait(lambda: any(isinstance(e.event, Impulse) for e in interaction.session().entries), 10, "an impulse")
-        page.press_button("Pause")
-        page.wait(lambda: not live.playing, 10, "a pause")
+        pause(viewer, page)
         recorded = interaction.trajectory()
         save_session(interaction.session(), tmp_path / "flick.json")
         page.press_button("Session")

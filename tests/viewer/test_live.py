@@ -17,28 +17,26 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 
 from gausim.core import ConfigError
+from gausim.interaction import interaction as interaction_module
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
-from gausim.viewer.companion import Companion
-from gausim.viewer.live import Live
+from gausim.viewer.live import Companion, Live
 from gausim.viewer.pointer import Pointer
-from gausim.viewer.shown import LIVE, Shown, Take
+from gausim.viewer.shown import LIVE, Take
 from gausim.viewer.splats import SIZE, Placing
 
 
 @pytest.fixture
-def live(make_interaction: Callable[..., Interaction]) -> tuple[Live, list[Shown]]:
-    shown: list[Shown] = []
-    return Live(make_interaction(keep=None), shown.append), shown
+def one(make_interaction: Callable[..., Interaction]) -> Live:
+    return Live(make_interaction(keep=None), lambda _: None)
 
 
-def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> None:
-    one, _ = live
+def test_a_dragged_pin_takes_its_hand_along(one: Live) -> None:
     interaction = one.interaction
     scene, placing = interaction.scene, Placing.of(interaction.scene)
-    pointer = Pointer(MagicMock(), one, placing, interaction.units, interaction.masses)
+    pointer = Pointer(MagicMock(), one, placing)
     pointer.follow(one.shown())
     followed: list[tuple[float, float, float]] = []
     pointer.hand_moved = lambda hand, to: followed.append(to)
@@ -74,8 +72,7 @@ def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> N
     assert interaction.session().entries[-1].event.to == pytest.approx((0.1, 0.1, 0.0), abs=1e-5)  # goes on from there
 
 
-def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]) -> None:
-    one, _ = live
+def test_what_was_done_is_played_back_bit_for_bit(one: Live) -> None:
     for number in range(12):
         if number == 2:
             one.act(Force(Unit(1, 3), (1.0, 0, 0), 2.0, name="drag-0"))
@@ -101,8 +98,7 @@ def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]
     assert torch.equal(replay(one.interaction, session).positions, recorded.positions)
 
 
-def test_the_timeline_goes_back_and_play_goes_on_from_the_end(live: tuple[Live, list[Shown]]) -> None:
-    one, _ = live
+def test_the_timeline_goes_back_and_play_goes_on_from_the_end(one: Live) -> None:
     one.act(Gravity((1.0, 0.0, 0.0), 1.0))
     for _ in range(6):
         one.advance()
@@ -119,11 +115,8 @@ def test_the_timeline_goes_back_and_play_goes_on_from_the_end(live: tuple[Live, 
         assert one.shown().number == 0
 
 
-def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(
-    make_interaction: Callable[..., Interaction],
-) -> None:
-    shown: list[Shown] = []
-    one = Live(make_interaction(farthest=1e-4), shown.append)
+def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(one: Live, monkeypatch) -> None:
+    monkeypatch.setattr(interaction_module, "FARTHEST", 1e-4)
     one.act(Gravity((1.0, 0.0, 0.0), 2.0))
     one.start()
     while one.playing:
@@ -143,8 +136,7 @@ def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(
     one.join(5)
 
 
-def test_too_many_commands_let_everything_go(live: tuple[Live, list[Shown]]) -> None:
-    one, _ = live
+def test_too_many_commands_let_everything_go(one: Live) -> None:
     one.act(Force(Whole(), (1.0, 0, 0), 1.0))
     for _ in range(5000):
         one.do(lambda: None)

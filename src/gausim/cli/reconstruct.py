@@ -229,8 +229,7 @@ def _fit(
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
     """Draws truth, rendering and four times the difference (rows) of held-out and then training stills (columns)."""
     from gausim.data.images import composite
-    from gausim.reconstruction.stills import draw_rest
-    from gausim.render.draw import to_bytes
+    from gausim.render.draw import draw_still, to_bytes
     from gausim.report.pictures.figures import picture_grid
 
     size = sets[0].cameras.width, sets[0].cameras.height
@@ -240,7 +239,7 @@ def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...
     for images, count in zip(alike, counts, strict=False):
         total = len(images.images)
         chosen = images.select(sorted({i * total // count for i in range(count)}))
-        truth, drawn = composite(chosen.images)[0], draw_rest(scene, renderer, chosen.cameras)
+        truth, drawn = composite(chosen.images)[0], draw_still(renderer, scene, chosen.cameras).rgb[0].clamp(0, 1)
         for row, pictures in zip(rows.values(), (truth, drawn, 4 * (drawn - truth).abs()), strict=True):
             row += [to_bytes(picture).numpy() for picture in pictures]
     labels = [label for label, row in rows.items() for _ in row]

@@ -14,7 +14,7 @@ from gausim.core import Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Property
-from gausim.viewer.companion import Companion
+from gausim.viewer.live import Companion
 from gausim.viewer.shown import Take
 from gausim.viewer.subject import Films, Subject
 

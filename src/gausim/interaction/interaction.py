@@ -82,7 +82,6 @@ class Interaction:
         units: Sequence[Int[Tensor, " K"]] = (),
         gravity: float = STANDARD_GRAVITY,
         most_force: float = MOST_FORCE,
-        farthest: float = FARTHEST,
         seed: int = 0,
         keep: int | None = 0,
         hands: Hands | None = None,
@@ -98,7 +97,6 @@ class Interaction:
             units: the unit of every kernel at levels 1, 2, ... of the hierarchy; -1 for kernels of no unit.
             gravity: ratio of weight to mass [scene units / s^2].
             most_force: the largest force, and the largest sum of forces on a kernel [weights].
-            farthest: distance of a kernel from rest at which the simulation stops [diagonals].
             seed: seed of the gusts of wind.
             keep: number of latest frames kept for :meth:`trajectory`; None keeps all.
             hands: recorded poses of the hands by frame since ``initial``, which each hand follows until it is moved.
@@ -106,12 +104,12 @@ class Interaction:
         Raises:
             ConfigError: a number is not positive and finite.
         """
-        for name, value in (("gravity", gravity), ("most_force", most_force), ("farthest", farthest)):
+        for name, value in (("gravity", gravity), ("most_force", most_force)):
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"interaction: {name}: expected a number > 0, got {value}.")
         self.scene, self.made_with, self.units = scene, made_with, tuple(units)
         self.gravity, self.most_force, self.seed = gravity, most_force, seed
-        self._dynamics, self._initial, self._farthest, self._recorded = dynamics, initial, farthest, hands
+        self._dynamics, self._initial, self._recorded = dynamics, initial, hands
         self.masses = masses.to(initial.positions)
         self._rest = scene.means.to(initial.positions)
         self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
@@ -366,12 +364,12 @@ class Interaction:
     def _check(self, frame: SteppedFrame) -> None:
         number = self.frame_number + 1
         away = (frame.positions - self._rest).norm(dim=-1) / self._diagonal
-        gone = ~(away <= self._farthest)  # also NaN
+        gone = ~(away <= FARTHEST)  # also NaN
         if bool(gone.any()):
             kernel = int(gone.nonzero()[0])
             raise DivergenceError(
                 f"{self.scene.name}: kernel {kernel} is {float(away[kernel]):.3g} diagonals from rest at frame "
-                f"{number}, expected at most {self._farthest:g}. Reset, and use smaller forces."
+                f"{number}, expected at most {FARTHEST:g}. Reset, and use smaller forces."
             )
         g = frame.deformation_gradients.double()
         volume = determinant(g).abs() / g.square().sum((-2, -1)).pow(1.5)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import msgspec
 import torch
@@ -125,9 +125,7 @@ class Reset(_EventBase, frozen=True):
 
 
 Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Material | Reset
-KINDS: dict[str, type] = {
-    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Material, Reset)
-}
+KINDS: dict[str, type] = {kind.__name__.lower(): kind for kind in get_args(Event)}
 
 
 class Entry(Checked, frozen=True):

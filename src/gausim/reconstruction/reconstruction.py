@@ -143,13 +143,15 @@ class Reconstruction:
         self._generator = torch.Generator().manual_seed(options.seed)
         self._queues: list[list[int]] = [[] for _ in sets]
         self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3)
-        self._rounds, self._patience = options.round_steps, _Patience(options)
+        self._rounds = options.round_steps
+        # Sum and number of the losses of this interval, the best mean, and the intervals since the best one.
+        self._patience = [0.0, 0.0, math.inf, 0.0]
         self.done, self.loss = 0, math.nan
 
     @property
     def finished(self) -> bool:
         """True after all steps, or after an early stop."""
-        return self.done >= self._options.iterations or self._patience.over
+        return self.done >= self._options.iterations or 0 < self._options.patience <= self._patience[3]
 
     def step(self) -> None:
         """One optimiser step on one image.
@@ -180,7 +182,8 @@ class Reconstruction:
             self._prune()
             self._densify(self._rounds.index(self.done), len(self._rounds))
             self.splats.forget()
-        self._patience.note(self.done, self.loss)
+        if self.done > self._rounds[-1]:
+            self._note_loss()
         self.done += 1
 
     def scene(self) -> GaussianScene:
@@ -197,7 +200,7 @@ class Reconstruction:
             **queues,
             "done": torch.tensor(self.done),
             "generator": self._generator.get_state(),
-            "patience": torch.tensor(self._patience.state, dtype=torch.float64),
+            "patience": torch.tensor(self._patience, dtype=torch.float64),
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
@@ -206,7 +209,7 @@ class Reconstruction:
         self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
         self.done = int(state["done"])
         self._generator.set_state(state["generator"])
-        self._patience.state = state["patience"].tolist()
+        self._patience = state["patience"].tolist()
 
     def _draw(self) -> tuple[ImageSet, int]:
         """A set drawn by its weight, and the index of an image in it; a set shows all images before one is repeated."""
@@ -256,11 +259,11 @@ class Reconstruction:
     def _lasting(self) -> Bool[Tensor, " K"]:
         """Mask of the kernels that are opaque and within bounds."""
         opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
-        return opaque & self._start.bounds.contains(self.splats["means"].detach())
+        return opaque & self._start.contains(self.splats["means"].detach())
 
     @torch.no_grad()
     def _limit(self) -> None:
-        largest = self._start.bounds.largest(self.splats["means"].detach())
+        largest = self._start.largest(self.splats["means"].detach())
         self.splats["log_scales"].copy_(torch.minimum(self.splats["log_scales"], largest.log()[:, None]))
 
     def _prune(self) -> None:
@@ -281,32 +284,14 @@ class Reconstruction:
         if count > 0 and done < rounds - 1:
             self.splats.split(self.splats.error.topk(count).indices)
 
-
-class _Patience:
-    """Early stopping when the mean loss over an interval of steps no longer falls.
-
-    Attributes:
-        state: sum and number of the losses of this interval, the best mean, and the intervals since the best one.
-    """
-
-    def __init__(self, options: ReconstructionOptions) -> None:
-        self._allowed, self._length = options.patience, max(1, options.iterations // INTERVALS)
-        self._first = options.round_steps[-1] + 1
-        self.state = [0.0, 0.0, math.inf, 0.0]
-
-    @property
-    def over(self) -> bool:
-        return self._allowed > 0 and self.state[3] >= self._allowed
-
-    def note(self, step: int, loss: float) -> None:
-        if step < self._first:
-            return
-        total, count, best, worse = self.state[0] + loss, self.state[1] + 1, *self.state[2:]
-        if count >= self._length:
+    def _note_loss(self) -> None:
+        """Counts the intervals of steps over which the mean loss no longer falls, for early stopping."""
+        total, count, best, worse = self._patience[0] + self.loss, self._patience[1] + 1, *self._patience[2:]
+        if count >= max(1, self._options.iterations // INTERVALS):
             mean = total / count
             worse = 0.0 if mean < (1 - BETTER) * best else worse + 1
             total, count, best = 0.0, 0.0, min(best, mean)
-        self.state = [total, count, best, worse]
+        self._patience = [total, count, best, worse]
 
 
 def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud | None, name: str) -> Start:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
 from gausim.core import DataError
-from gausim.ops.visual_hull import VoxelHull, carve, farthest_points, project
+from gausim.ops.visual_hull import carve, farthest_points, project
 from gausim.reconstruction.stills import ImageSet
 
 # Least alpha (of 255) of pixels from which initial colours are read; the rim is mixed with the background.
@@ -26,37 +27,6 @@ OBJECT_CEILING = 1.5
 SMALLEST = 1e-4
 # Largest standard deviation of a kernel of an open scene [distances to the nearest camera].
 OPEN_CEILING = 0.2
-
-
-@dataclass(frozen=True, eq=False)
-class WithinHull:
-    """Bounds of an object."""
-
-    hull: VoxelHull  # the body within which the centres are
-    ceiling: float  # largest standard deviation [scene units]
-
-    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """True for points within the hull."""
-        return self.hull.contains(points)
-
-    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """Largest standard deviation at points: a constant [scene units]."""
-        return torch.full_like(points[:, 0], self.ceiling)
-
-
-@dataclass(frozen=True, eq=False)
-class BeforeCameras:
-    """Bounds of an open scene: kernels are too small to reach a camera, where they would fill the image."""
-
-    centers: Float[Tensor, "V 3"]  # centres of the cameras [scene units]
-
-    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """True for finite points."""
-        return torch.isfinite(points).all(-1)
-
-    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """Largest standard deviation at points: a fraction of the distance to the nearest camera [scene units]."""
-        return OPEN_CEILING * torch.cdist(points, self.centers).amin(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +52,8 @@ class Start:
     points: Float[Tensor, "K 3"]  # centres [scene units]
     colors: Float[Tensor, "K 3"]  # RGB in [0, 1]
     scales: Float[Tensor, " K"]  # standard deviations [scene units]
-    bounds: WithinHull | BeforeCameras  # bounds of positions and sizes
+    contains: Callable[[Tensor], Tensor]  # mask of the points (N, 3) that are within bounds
+    largest: Callable[[Tensor], Tensor]  # largest standard deviation at points (N, 3) [scene units]
     extent: float  # unit of the positions' learning rate [scene units]
 
 
@@ -121,26 +92,30 @@ def start_object(
     points, normals = points[index], normals[index]
     distance = neighbour_distance(points)
     chosen = _surface_colors(points, normals, images) if colors is None else colors[index]
-    scales = 0.6 * distance.clamp_min(1e-3 * hull.spacing)
-    return Start(points, chosen, scales, WithinHull(room, OBJECT_CEILING * float(distance.mean())), hull.diagonal)
+    scales, ceiling = 0.6 * distance.clamp_min(1e-3 * hull.spacing), OBJECT_CEILING * float(distance.mean())
+    return Start(points, chosen, scales, room.contains, lambda at: torch.full_like(at[:, 0], ceiling), hull.diagonal)
 
 
 def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
     """Balls on all points of an open scene, as large as the distances to their neighbours.
 
-    Colours come from the points. They cannot be read from the images, where a point may be occluded, and kernels that
-    start with the colour of another surface become fog.
+    Kernels stay too small to reach a camera, where they would fill the image. Colours come from the points. They cannot
+    be read from the images, where a point may be occluded, and kernels that start with the colour of another surface
+    become fog.
 
     Raises:
         DataError: the points have no colours.
     """
     if cloud.colors is None:
         raise DataError(f"{name}: points of an open scene need colours. Take the points.npz that `poses` wrote.")
-    centers = images.cameras.centers
-    points, bounds = cloud.points.float(), BeforeCameras(centers)
+    centers, points = images.cameras.centers, cloud.points.float()
+
+    def largest(at: Tensor) -> Tensor:
+        return OPEN_CEILING * torch.cdist(at, centers).amin(-1)
+
     extent = float((centers - points.median(0).values).norm(dim=-1).mean())
-    scales = torch.minimum(neighbour_distance(points).clamp_min(SMALLEST * extent), bounds.largest(points))
-    return Start(points, cloud.colors, scales, bounds, extent)
+    scales = torch.minimum(neighbour_distance(points).clamp_min(SMALLEST * extent), largest(points))
+    return Start(points, cloud.colors, scales, lambda at: torch.isfinite(at).all(-1), largest, extent)
 
 
 def neighbour_distance(points: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -16,7 +16,7 @@ from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import STILLS_PER_HELDOUT, Stills, read_stills
 from gausim.metrics.image import PSNR, SSIM, ForegroundPSNR
-from gausim.render.draw import draw
+from gausim.render.draw import draw_still
 
 # Number of images drawn and compared together, limited because photos have several megapixels.
 MEASURED_AT_ONCE = 4
@@ -65,21 +65,15 @@ def gather_stills(
     stills = read_stills(path, every=every, opaque=opaque)
     if len(stills.images) < 2:
         raise DataError(f"{path}: {len(stills.images)} stills; expected at least two views of the object.")
-    train = _part(stills, stills.train, "stills to train on")
-    left_out = _left_out(stills)
+    train, left_out = _split(stills, "stills to train on")
     side = max(stills.cameras.width, stills.cameras.height)
     if longest is not None and side > longest:
-        train, left_out = _scaled(train, longest / side), tuple(_scaled(s, longest / side) for s in left_out)
-    measured = (*left_out, train) if stills.heldout else left_out
+        train, left_out = reduced(train, longest / side), reduced(left_out, longest / side)
+    measured = (left_out, train) if stills.heldout else (left_out,)
     if not coarse:
         return Material((train,), measured)
-    half = replace(_scaled(train, 0.5), span=(0.0, coarse))
+    half = replace(reduced(train, 0.5), span=(0.0, coarse))
     return Material((half, replace(train, span=(coarse, 1.0))), measured)
-
-
-def _scaled(images: ImageSet, factor: float) -> ImageSet:
-    width, height = (max(1, round(length * factor)) for length in (images.cameras.width, images.cameras.height))
-    return replace(reduced(images, (width, height), weight=images.weight), name=images.name)
 
 
 def gather_object(data: ObjectData, *, video_fraction: float = 0.5) -> Material:
@@ -90,22 +84,18 @@ def gather_object(data: ObjectData, *, video_fraction: float = 0.5) -> Material:
     (0: stills only) is at the size of the video: a quarter of it on the first frames, the others on the stills
     reduced to that size. Views that are held out are only measured.
     """
-    stills = data.stills()
-    train = _part(stills, stills.train, "stills", weight=1 - video_fraction)
-    measured = list(_left_out(stills))
+    train, left_out = _split(data.stills(), "stills", weight=1 - video_fraction)
     if not (data.root / "sequences").is_dir():
-        return Material((train,), tuple(measured))
+        return Material((train,), (left_out,))
     first, heldout = first_frames(data, data.train_views), first_frames(data, data.heldout_views)
-    measured += [s for s in (first, heldout) if s is not None]
+    measured = (left_out, *(s for s in (first, heldout) if s is not None))
     if first is None or video_fraction <= 0:
-        return Material((train,), tuple(measured))
+        return Material((train,), measured)
     factor = first.cameras.width / train.cameras.width
-    sets = [train]
-    if factor < 1:
-        size = first.cameras.width, max(1, round(train.cameras.height * factor))
-        sets.append(reduced(train, size, weight=0.75 * video_fraction))
-    sets.append(ImageSet(first.name, first.images, first.cameras, video_fraction * (0.25 if factor < 1 else 1.0)))
-    return Material(tuple(sets), tuple(measured))
+    if factor >= 1:
+        return Material((train, replace(first, weight=video_fraction)), measured)
+    smaller = replace(reduced(train, factor), weight=0.75 * video_fraction)
+    return Material((train, smaller, replace(first, weight=0.25 * video_fraction)), measured)
 
 
 def first_frames(data: ObjectData, views: Sequence[str]) -> ImageSet | None:
@@ -132,24 +122,18 @@ def first_frames(data: ObjectData, views: Sequence[str]) -> ImageSet | None:
     return ImageSet(kind, torch.stack(images), joined)
 
 
-def reduced(images: ImageSet, size: tuple[int, int], *, weight: float) -> ImageSet:
-    """The set at a smaller ``size`` = (width, height), by area means of premultiplied colours, with its cameras."""
+def reduced(images: ImageSet, factor: float) -> ImageSet:
+    """The set and its cameras at ``factor`` < 1 of the size, by area means of premultiplied colours."""
+    cameras = images.cameras
+    width, height = (max(1, round(length * factor)) for length in (cameras.width, cameras.height))
     values = images.images.permute(0, 3, 1, 2).float()
     premultiplied = torch.cat((values[:, :3] * values[:, 3:] / 255, values[:, 3:]), 1)
-    mean = functional.adaptive_avg_pool2d(premultiplied, (size[1], size[0]))
+    mean = functional.adaptive_avg_pool2d(premultiplied, (height, width))
     straight = torch.cat((mean[:, :3] * 255 / mean[:, 3:].clamp_min(1e-3), mean[:, 3:]), 1)
     pixels = straight.round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
-    factor = torch.tensor([size[0] / images.cameras.width, size[1] / images.cameras.height, 1.0])
-    cameras = Cameras(images.cameras.viewmats, images.cameras.Ks * factor[:, None], *size, images.cameras.names)
-    return ImageSet(f"{images.name} reduced", pixels, cameras, weight)
-
-
-@torch.no_grad()
-def draw_rest(scene: GaussianScene, renderer: Renderer, cameras: Cameras) -> Float[Tensor, "V H W 3"]:
-    """The scene at rest in every camera, over black, clamped to [0, 1]."""
-    identity, unit = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.int64)
-    drawn = draw(renderer, scene, scene.means[None], identity, identity, unit, cameras)
-    return drawn.rgb[0].clamp(0, 1)
+    scale = torch.tensor([width / cameras.width, height / cameras.height, 1.0])
+    smaller = replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
+    return replace(images, images=pixels, cameras=smaller)
 
 
 def measure(scene: GaussianScene, renderer: Renderer, images: ImageSet) -> dict[str, float]:
@@ -158,18 +142,15 @@ def measure(scene: GaussianScene, renderer: Renderer, images: ImageSet) -> dict[
     for start in range(0, len(images.images), MEASURED_AT_ONCE):
         part = images.select(range(start, min(start + MEASURED_AT_ONCE, len(images.images))))
         truth, alpha = composite(part.images)
-        drawn = draw_rest(scene, renderer, part.cameras)
+        drawn = draw_still(renderer, scene, part.cameras).rgb[0].clamp(0, 1)
         for metric in metrics:
             metric.update(drawn, truth, alpha > 0)
     return {metric.key: float(metric.compute()) for metric in metrics}
 
 
-def _part(stills: Stills, index: Sequence[int], name: str, *, weight: float = 1.0) -> ImageSet:
-    # Of fewer than ten stills none is left out: all are used in training and measured.
-    return ImageSet(name, stills.images, stills.cameras, weight).select(index)
-
-
-def _left_out(stills: Stills) -> tuple[ImageSet, ...]:
-    if stills.heldout:
-        return (_part(stills, stills.heldout, "stills left out"),)
-    return (_part(stills, stills.train, "stills (all used, none left out)"),)
+def _split(stills: Stills, name: str, *, weight: float = 1.0) -> tuple[ImageSet, ImageSet]:
+    """The stills to train on, and those left out; of fewer than ten none is, all are used in training and measured."""
+    train = ImageSet(name, stills.images, stills.cameras, weight).select(stills.train)
+    if not stills.heldout:
+        return train, replace(train, name="stills (all used, none left out)")
+    return train, ImageSet("stills left out", stills.images, stills.cameras).select(stills.heldout)

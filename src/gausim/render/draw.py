@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,7 +126,8 @@ def draw_still(renderer: Renderer, scene: GaussianScene, cameras: Cameras, **opt
     return draw(renderer, scene, scene.means[None], identity, identity, units, cameras, **options)
 
 
-def draw_trajectory(
+@torch.no_grad()
+def film(
     renderer: Renderer,
     scene: GaussianScene | SceneAppearance,
     trajectory: Trajectory,
@@ -135,33 +135,20 @@ def draw_trajectory(
     *,
     mask: Bool[Tensor, " K"] | None = None,
     background: Float[Tensor, " 3"] | None = None,
-    chunk: int = 16,
-) -> Iterator[Rendered]:
-    """Draws a trajectory for evaluation, ``chunk`` frames (frames, V, ...) at a time, without loss gradients."""
-    look = SceneAppearance.of(scene, mask) if isinstance(scene, GaussianScene) else scene
-    for start in range(0, trajectory.frames, chunk):
-        now, unit = trajectory.part(slice(start, start + chunk)), trajectory.unit_of_kernel
-        state = now.positions, now.deformation_gradients, now.rotations
-        with torch.no_grad():
-            images = draw(renderer, look, *state, unit, cameras, background=background)
-        yield images
-
-
-def film(
-    renderer: Renderer,
-    scene: GaussianScene | SceneAppearance,
-    trajectory: Trajectory,
-    cameras: Cameras,
-    *,
     as_bytes: bool = True,
-    **options: Any,
+    chunk: int = 16,
 ) -> Tensor:
     """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped).
 
-    The options are those of :func:`draw_trajectory`.
+    They are drawn ``chunk`` frames at a time, without loss gradients.
     """
-    parts = draw_trajectory(renderer, scene, trajectory, cameras, **options)
-    return torch.cat([to_bytes(part.rgb) if as_bytes else part.rgb for part in parts])
+    look, parts = SceneAppearance.of(scene, mask) if isinstance(scene, GaussianScene) else scene, []
+    for start in range(0, trajectory.frames, chunk):
+        now = trajectory.part(slice(start, start + chunk))
+        state = now.positions, now.deformation_gradients, now.rotations, trajectory.unit_of_kernel
+        rgb = draw(renderer, look, *state, cameras, background=background).rgb
+        parts.append(to_bytes(rgb) if as_bytes else rgb)
+    return torch.cat(parts)
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> Tensor:

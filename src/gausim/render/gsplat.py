@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 from collections.abc import Callable
 from typing import Any
@@ -62,7 +63,6 @@ class GsplatRenderer:
         """
         require_options(near, ALPHA_MAX)
         self.near = near
-        self._rasterization: Callable[..., Any] | None = None
 
     def __call__(
         self,
@@ -89,14 +89,13 @@ class GsplatRenderer:
                     f"GsplatRenderer: expected {name} as float32 on a CUDA device, got {value.dtype} on "
                     f"{value.device}. Set trainer=gpu, or use render=cpu for tensors on the CPU."
                 )
-        rasterization = self._load()
         behind = means.new_zeros(3) if background is None else background.to(means)
         views = viewmats.shape[:2]
         if means.shape[1] == 0:  # gsplat divides by the number of kernels
             empty = colors.sum()  # zero; it keeps an image without kernels differentiable
             plane = empty.expand(*views, size[1], size[0])
             return Rendered(plane[..., None] + behind, plane, plane if depth else None)
-        image, alpha, _ = rasterization(
+        image, alpha, _ = self._rasterization(
             means=means,
             quats=None,
             scales=None,
@@ -117,15 +116,14 @@ class GsplatRenderer:
         )
         return Rendered(image[..., :3], alpha[..., 0], image[..., 3] if depth else None)
 
-    def _load(self) -> Callable[..., Any]:
-        if self._rasterization is None:
-            reason = unavailable()
-            if reason is not None:
-                raise ConfigError(
-                    f"render=gsplat: {reason}. See docs/how-to/clusters-and-gpus.md, or let render=auto choose what "
-                    "this machine can do."
-                )
-            from gsplat import rasterization
+    @functools.cached_property
+    def _rasterization(self) -> Callable[..., Any]:
+        reason = unavailable()
+        if reason is not None:
+            raise ConfigError(
+                f"render=gsplat: {reason}. See docs/how-to/clusters-and-gpus.md, or let render=auto choose what this "
+                "machine can do."
+            )
+        from gsplat import rasterization
 
-            self._rasterization = rasterization
-        return self._rasterization
+        return rasterization

@@ -58,21 +58,15 @@ class ReferenceRenderer:
     ) -> Rendered:
         """Draws B states in V views each (see core.Renderer)."""
         behind = means.new_zeros(3) if background is None else background.to(means)
-        rgb, far, alpha = [], [], []
-        for b in range(viewmats.shape[0]):
-            for v in range(viewmats.shape[1]):
-                image, through = self._view(
-                    means[b], covars[b], colors[b, v], opacities[b], viewmats[b, v], Ks[b, v], size
-                )
-                rgb.append(image[..., :3] + through[..., None] * behind)
-                far.append(image[..., 3])
-                alpha.append(1 - through)
-        shape = (*viewmats.shape[:2], size[1], size[0])
-        return Rendered(
-            torch.stack(rgb).reshape(*shape, 3),
-            torch.stack(alpha).reshape(shape),
-            torch.stack(far).reshape(shape) if depth else None,
-        )
+        states, views = viewmats.shape[:2]
+        drawn = [
+            self._view(means[b], covars[b], colors[b, v], opacities[b], viewmats[b, v], Ks[b, v], size)
+            for b in range(states)
+            for v in range(views)
+        ]
+        image, through = (torch.stack(parts).unflatten(0, (states, views)) for parts in zip(*drawn, strict=True))
+        rgb = image[..., :3] + through[..., None] * behind
+        return Rendered(rgb, 1 - through, image[..., 3] if depth else None)
 
     def _view(
         self,
@@ -92,7 +86,9 @@ class ReferenceRenderer:
         mean2d, covar2d = project(camera[index], covars[index], viewmat[:3, :3], K, size)
         parts = mean2d, inverse_2x2(covar2d), opacities[index, None], colors[index], camera[index, 2:]
         kernels = torch.cat(parts, 1)
-        reach = _reach(covar2d.detach(), opacities[index].detach())
+        # Half width and half height of the ellipse within which alpha >= 1/255 [pixels].
+        t = 2 * torch.log(255 * opacities[index].detach()).clamp_min(0.0)
+        reach = torch.sqrt(t[:, None] * covar2d.detach().diagonal(dim1=-2, dim2=-1))
         width, height = size
         columns, rows = -(-width // TILE), -(-height // TILE)
         hits = _tile_hits(mean2d.detach(), reach, columns, rows)
@@ -152,12 +148,6 @@ def inverse_2x2(matrix: Float[Tensor, "K 2 2"]) -> Float[Tensor, "K 3"]:
     """Upper triangle (A, B, C) of the inverse of symmetric matrices."""
     a, b, c = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
     return torch.stack((c, -b, a), -1) / (a * c - b * b)[:, None]
-
-
-def _reach(covar2d: Float[Tensor, "K 2 2"], opacities: Float[Tensor, " K"]) -> Float[Tensor, "K 2"]:
-    """Half width and half height of the ellipse within which alpha >= 1/255 [pixels]."""
-    t = 2 * torch.log(255 * opacities)
-    return torch.sqrt(t.clamp_min(0.0)[:, None] * torch.stack((covar2d[:, 0, 0], covar2d[:, 1, 1]), -1))
 
 
 def _tile_hits(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,7 @@ _VIEWS = 10.0
 class _Painted:
     shown: Shown
     legend: Legend
-    buffer: UInt32[np.ndarray, "K 8"]
-    beside: UInt32[np.ndarray, "K2 8"] | None
+    buffers: list[UInt32[np.ndarray, "_ 8"]]  # of the object, and of that of the second method
 
 
 class Viewer:
@@ -54,7 +54,8 @@ class Viewer:
         scene = subject.interaction.scene
         self.server = GuardedServer(access, label="gausim")
         self.placing = Placing.of(scene)
-        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
+        painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
+        self._looks = [(painter, self.placing)]  # of the object, and of that of the second method
         self.workers = (Worker("paint", self._paint), Worker("send", self._send))
         self.live = Live(
             subject.interaction, self.workers[0].put, takes=subject.takes, companion=subject.companion,
@@ -62,22 +63,16 @@ class Viewer:
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
         self.server.scene.world_axes.visible = False
-        self.pointer = Pointer(
-            self.server, self.live, self.placing, subject.interaction.units, subject.interaction.masses
-        )
-        self.page = Page(
-            self.server, self.live, self.pointer, modes=self._painter.modes, title=subject.title,
-            down=f"+{subject.up[1:]}" if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
-            repaint=self.repaint, forget_scales=self._painter.forget,
-        )  # fmt: skip
+        self.pointer = Pointer(self.server, self.live, self.placing)
+        self.page = Page(self.server, self.live, self.pointer, subject, painter, self.repaint)
         self.camera_panel = CameraPanel(self.server, self.placing, subject)
         self.eye = torch.tensor(self.camera_panel.first_position, dtype=torch.float32)
         self._viewed = 0.0
         self._place_beside(subject)
         first = self._paint_now(self.live.shown())
-        self.server.frame_bytes = first.buffer.nbytes
-        self._splats = add_splats(self.server.scene, "/splats", first.buffer)
-        self._beside = add_splats(self.server.scene, "/beside", first.beside) if first.beside is not None else None
+        self.server.frame_bytes = first.buffers[0].nbytes
+        names = ("/splats", "/beside")
+        self._splats = [add_splats(self.server.scene, *shown) for shown in zip(names, first.buffers, strict=False)]
         self.server.on_client_connect(self._connected)
 
     def _place_beside(self, subject: Subject) -> None:
@@ -85,9 +80,9 @@ class Viewer:
             return
         other, offset = subject.companion.interaction, self.camera_panel.aside
         x, y, z = map(float, offset)
-        self._other_placing = Placing(self.placing.centre, self.placing.scale, (x, y, z))
-        self._other_painter = Painter(other.scene, other.units, other.masses)
-        top = float((self._other_placing.to_page(other.scene.means.float()).numpy() @ self.camera_panel.up).max())
+        placing = Placing(self.placing.centre, self.placing.scale, (x, y, z))
+        self._looks.append((Painter(other.scene, other.units, other.masses), placing))
+        top = float((placing.to_page(other.scene.means.float()).numpy() @ self.camera_panel.up).max())
         above = offset + (top + 0.06 * SIZE) * self.camera_panel.up
         self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
 
@@ -132,33 +127,29 @@ class Viewer:
 
     @torch.no_grad()
     def _paint_now(self, shown: Shown) -> _Painted:
-        legend, buffer = self._packed(self._painter, self.placing, shown, highlight=True)
-        beside = None
-        if shown.beside is not None:
-            _, beside = self._packed(self._other_painter, self._other_placing, shown.beside)
-        return _Painted(shown, legend, buffer, beside)
-
-    def _packed(
-        self, painter: Painter, placing: Placing, shown: Shown, *, highlight: bool = False
-    ) -> tuple[Legend, UInt32[np.ndarray, "K 8"]]:
-        mode = self.page.mode if self.page.mode in painter.modes else VIEW
-        eye = placing.to_scene(self.eye)
-        covars, rgb, legend = painter(shown.frame, shown.unit_of_kernel, shown.speed, mode, eye)
-        if highlight:
-            held = torch.zeros_like(self.pointer.mask) if shown.held is None else shown.held.cpu()
-            rgb = highlighted(rgb, self.pointer.mask, held)
-        return legend, pack(shown.frame.positions.cpu(), covars, rgb, painter.opacities, placing)
+        legends, buffers = [], []
+        for frame, (painter, placing) in zip((shown, shown.beside), self._looks, strict=False):
+            if frame is None:
+                continue
+            mode = self.page.mode if self.page.mode in painter.modes else VIEW
+            eye = placing.to_scene(self.eye)
+            covars, rgb, legend = painter(frame.frame, frame.unit_of_kernel, frame.speed, mode, eye)
+            if frame is shown:
+                held = torch.zeros_like(self.pointer.mask) if shown.held is None else shown.held.cpu()
+                rgb = highlighted(rgb, self.pointer.mask, held)
+            legends.append(legend)
+            buffers.append(pack(frame.frame.positions.cpu(), covars, rgb, painter.opacities, placing))
+        return _Painted(shown, legends[0], buffers)
 
     def _paint(self, shown: Shown) -> None:
         self.workers[1].put(self._paint_now(shown))
 
     def _send(self, painted: _Painted) -> None:
         with self.server.atomic():
-            self._splats.buffer = painted.buffer
-            if self._beside is not None:
-                self._beside.visible = painted.beside is not None
-                if painted.beside is not None:
-                    self._beside.buffer = painted.beside
+            for splats, buffer in zip_longest(self._splats, painted.buffers):
+                splats.visible = buffer is not None
+                if buffer is not None:
+                    splats.buffer = buffer
             self.pointer.follow(painted.shown)
         paused = not self.live.playing  # this frame must be displayed, as no other may follow
         displayed = 0.0 if paused else self.server.displayed

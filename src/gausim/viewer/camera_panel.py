@@ -68,39 +68,35 @@ class CameraPanel:
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position, target and vertical field of view of the initial view."""
         if self._cameras is not None:
-            position, forward, _, fov = self._pose(self._cameras, 0)
-            return position, position + forward * max(float(-position @ forward), 0.1), fov
+            position, target, _, fov = self._pose(self._cameras, 0)
+            return position, target, fov
         side = np.array([1.0, 0.0, 0.0]) if abs(self.up[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
         away = np.cross(side, self.up)
         return 1.5 * SIZE * (0.35 * side - away + 0.35 * self.up) / 1.12, np.zeros(3), _HEIGHT_OF_VIEW
 
     def _pose(self, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Position on the page, forward, up and vertical field of view of a camera."""
+        """Position and target on the page, up and vertical field of view of a camera."""
         view = cameras.viewmats[index].double().cpu()
         rotation = view[:3, :3].T.numpy()
         position = self._placing.to_page(cameras.centers[index].float().cpu()).double().numpy()
         fov = 2 * math.atan(cameras.height / 2 / float(cameras.Ks[index, 1, 1]))
-        return position, rotation[:, 2], -rotation[:, 1], fov
+        forward = rotation[:, 2]
+        return position, position + forward * max(float(-position @ forward), 0.1), -rotation[:, 1], fov
 
     def _add_cameras(self, cameras: Cameras) -> None:
         gui = self._server.gui
         with gui.add_folder("Cameras of the data set", expand_by_default=False):
             choice = gui.add_dropdown("Look from", (_FREE, *cameras.names), initial_value=_FREE)
 
-        async def chosen(event: Any) -> None:
-            if event.client is not None and choice.value in cameras.names:
-                self.look_from(event.client, cameras, cameras.names.index(choice.value))
+        async def look_from(event: Any) -> None:
+            if event.client is None or choice.value not in cameras.names:
+                return
+            position, target, up, fov = self._pose(cameras, cameras.names.index(choice.value))
+            with event.client.atomic():
+                camera = event.client.camera
+                camera.up_direction, camera.position, camera.look_at, camera.fov = up, position, target, fov
 
-        choice.on_update(chosen)
-
-    def look_from(self, client: Any, cameras: Cameras, index: int) -> None:
-        """Moves the view of one browser to a camera of the data set."""
-        position, forward, up, fov = self._pose(cameras, index)
-        with client.atomic():
-            client.camera.up_direction = up
-            client.camera.position = position
-            client.camera.look_at = position + forward * max(float(-position @ forward), 0.1)
-            client.camera.fov = fov
+        choice.on_update(look_from)
 
     def _add_films(self, films: Any) -> None:
         gui = self._server.gui

@@ -10,10 +10,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import msgspec
+
 from gausim.core import ConfigError, DivergenceError, GausSimError, Trajectory
 from gausim.interaction.interaction import Interaction
+from gausim.interaction.selections import Kernels, Unit
 from gausim.interaction.session import Event, ForceSession, Release
-from gausim.viewer.companion import Companion
 from gausim.viewer.pipeline import Rate
 from gausim.viewer.shown import LIVE, Shown, Take, shown_frame
 
@@ -22,6 +24,39 @@ _MOST_COMMANDS = 1024
 # Largest memory of the live simulation's timeline [bytes].
 _HISTORY_BYTES = 128 << 20
 _log = logging.getLogger(__name__)
+
+
+class Companion:
+    """A second method beside the first: an interaction that repeats the events of another one.
+
+    Attributes:
+        name: name on the page.
+        interaction: the simulation.
+        message: error that stopped it or rejected an event; empty without an error.
+    """
+
+    def __init__(self, name: str, interaction: Interaction) -> None:
+        self.name, self.interaction, self.message = name, interaction, ""
+
+    def act(self, event: Event, leader: Interaction) -> None:
+        """Applies an event of the leader; units become lists of kernels, as the hierarchies differ."""
+        on = getattr(event, "on", None)
+        if isinstance(on, Unit):
+            chosen = on.mask(leader.scene, leader.units).nonzero()[:, 0].tolist()
+            event = msgspec.structs.replace(event, on=Kernels(tuple(chosen)))
+        try:
+            self.interaction.act(event)
+            self.message = ""
+        except ConfigError as error:
+            self.message = str(error)
+
+    def step(self) -> None:
+        """Simulates one frame, unless the simulation has diverged."""
+        try:
+            if self.interaction.broken is None:
+                self.interaction.step()
+        except (DivergenceError, ConfigError) as error:
+            self.message = str(error)
 
 
 class Live(threading.Thread):

@@ -24,11 +24,11 @@ from gausim.interaction.session import (
     save_session,
 )
 from gausim.interaction.words import parse_direction
-from gausim.viewer.coloring import VIEW, Legend, gradient_css
-from gausim.viewer.grab import HAND_SECONDS
+from gausim.viewer.coloring import VIEW, Legend, Painter, gradient_css
 from gausim.viewer.live import Live
-from gausim.viewer.pointer import Pointer
+from gausim.viewer.pointer import HAND_SECONDS, Pointer
 from gausim.viewer.shown import LIVE, Shown
+from gausim.viewer.subject import Subject
 
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 # Message while forces are reduced.
@@ -48,23 +48,12 @@ class Page:
     """
 
     def __init__(
-        self,
-        server: Any,
-        live: Live,
-        pointer: Pointer,
-        *,
-        modes: tuple[str, ...],
-        title: str,
-        down: str = "-z",
-        sessions: Path,
-        repaint: Callable[[], None],
-        forget_scales: Callable[[], None],
+        self, server: Any, live: Live, pointer: Pointer, subject: Subject, painter: Painter, repaint: Callable[[], None]
     ) -> None:
-        """Builds the panel; ``down`` is the initial direction of gravity, ``sessions`` the folder of saved sessions."""
-        self._live, self._pointer, self._sessions = live, pointer, sessions
-        self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
-        self.mode, self.saved = VIEW, list[Path]()
-        self._refreshed, self._modes = 0.0, modes
+        """Builds the panel; ``repaint`` requests new colours of the shown frame."""
+        self._live, self._pointer, self._subject = live, pointer, subject
+        self._repaint, self._painter = repaint, painter
+        self.mode, self.saved, self._refreshed = VIEW, list[Path](), 0.0
         gui = server.gui
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
@@ -76,12 +65,12 @@ class Page:
 
     def _play_tab(self, gui: Any) -> None:
         live = self._live
-        gui.add_html(f"<div style='padding:0 .6em;font-size:.85em'><b>{html.escape(self._title)}</b></div>")
+        gui.add_html(f"<div style='padding:0 .6em;font-size:.85em'><b>{html.escape(self._subject.title)}</b></div>")
         sources = (LIVE, *(take.name for take in live.takes))
         self._source = gui.add_dropdown("Shows", sources, initial_value=LIVE, hint="Recordings cannot be pushed.")
         self._on_change(self._source, sources, lambda name: live.do(lambda: live.choose(name)))
         works = {"Play": live.play, "Pause": live.pause, "Step": live.step_once, "Reset": self._reset}
-        self._on_press_of(gui.add_button_group("Time", tuple(works)), works)
+        self._add_buttons(gui, "Time", works)
         pace = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
         self._on_change(pace, (0.1, 4.0), lambda value: setattr(live, "pace", value))
         self._timeline = gui.add_slider("Frame", 0, 1, 1, 0, hint="The timeline; moving it stops time.")
@@ -101,16 +90,17 @@ class Page:
         gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, pointer.gain, hint="Weights of the part per diagonal of drag")
         self._on_change(gain, (0.5, 20.0), lambda value: setattr(pointer, "gain", value))
         works = {"Pin": lambda: self._on_selection(Pin), "Unpin": lambda: self._on_selection(Unpin)}
-        self._on_press_of(gui.add_button_group("Selection", tuple(works)), works)
+        self._add_buttons(gui, "Selection", works)
         self._on_press(gui.add_button("Let go of everything"), self._let_go)
         with gui.add_folder("Impulse", expand_by_default=False):
             self._amount = gui.add_slider("Weight s", 0.0, 0.3, 0.01, 0.1, hint="1 gives the speed of 1 s of weight")
             self._toward = gui.add_dropdown("Towards", AXES, initial_value="+x")
             self._on_press(gui.add_button("Push once"), lambda: self._on_selection(self._impulse))
-        self._strengths = [self._steady(gui, "Wind", "+x", Wind), self._steady(gui, "Gravity", self._down, Gravity)]
+        up = self._subject.up
+        down = f"+{up[1:]}" if up.startswith("-") else f"-{up}"
+        self._strengths = [self._steady(gui, "Wind", "+x", Wind), self._steady(gui, "Gravity", down, Gravity)]
         if self._live.interaction.hand is not None:
             self._strengths += self._hand(gui)
-
         self._factors = self._material(gui) if self._live.interaction.adjustable else []
 
     def _material(self, gui: Any) -> list[Any]:
@@ -120,33 +110,25 @@ class Page:
                 gui.add_slider(f"{name} times", 0.1, 10.0, 0.1, 1.0, hint="1: as given on the command line")
                 for name in ("Stiffness", "Damping")
             ]
-
-        def change(_: object) -> None:
-            event = Material(*(float(factor.value) for factor in factors))
-            self._live.do(lambda: self._live.act(event))
-
-        for factor in factors:
-            self._on_change(factor, (0.1, 10.0), change)
+        self._on_changes(factors, (0.1, 10.0), lambda: Material(*(float(factor.value) for factor in factors)))
         return factors
 
     def _hand(self, gui: Any) -> list[Any]:
         """Sliders of where the pins are held, relative to rest."""
-        scene, fps = self._live.interaction.scene, self._live.interaction.fps
+        diagonal, frames = self._live.interaction.scene.diagonal, round(HAND_SECONDS * self._live.interaction.fps)
         with gui.add_folder("Hand", expand_by_default=False):
             hint = "Moves what is pinned, in diagonals of the object"
             places = [gui.add_slider(f"Hand {axis}", -_HAND_REACH, _HAND_REACH, 0.01, 0.0, hint=hint) for axis in "xyz"]
 
-        def move(_: object) -> None:
-            x, y, z = (scene.diagonal * float(place.value) for place in places)
-            event = Hand((x, y, z), max(1, round(HAND_SECONDS * fps)))
-            self._live.do(lambda: self._live.act(event))
+        def move() -> Hand:
+            x, y, z = (diagonal * float(place.value) for place in places)
+            return Hand((x, y, z), max(1, frames))
 
         def follow(hand: int, to: tuple[float, float, float]) -> None:
             for place, value in zip(places, to, strict=True) if hand == 0 else ():
-                place.value = min(max(value / scene.diagonal, -_HAND_REACH), _HAND_REACH)
+                place.value = min(max(value / diagonal, -_HAND_REACH), _HAND_REACH)
 
-        for place in places:
-            self._on_change(place, (-_HAND_REACH, _HAND_REACH), move)
+        self._on_changes(places, (-_HAND_REACH, _HAND_REACH), move)
         self._pointer.hand_moved = follow
         return places
 
@@ -155,39 +137,56 @@ class Page:
             strength = gui.add_slider(f"{name} [weights]", 0.0, 3.0, 0.05, 0.0)
             toward = gui.add_dropdown(f"{name} towards", AXES, initial_value=axis)
 
-        def blow(_: object) -> None:
-            event = kind(parse_direction(toward.value), float(strength.value))
-            self._live.do(lambda: self._live.act(event))
+        def blow() -> Wind | Gravity:
+            return kind(parse_direction(toward.value), float(strength.value))
 
-        self._on_change(strength, (0.0, 3.0), blow)
-        self._on_change(toward, AXES, blow)
+        self._on_changes([strength], (0.0, 3.0), blow)
+        self._on_changes([toward], AXES, blow)
         return strength
 
     def _look_tab(self, gui: Any) -> None:
-        choice = gui.add_dropdown("Colours", self._modes, initial_value=self.mode)
-        self._on_change(choice, self._modes, self._recolour)
+        modes = self._painter.modes
+        choice = gui.add_dropdown("Colours", modes, initial_value=self.mode)
+        self._on_change(choice, modes, self._recolour)
         self._legend = gui.add_html("")
 
     def _session_tab(self, gui: Any) -> None:
         gui.add_html(_small("Everything done to the object is recorded and can be replayed bit for bit."))
-        gui.add_button("Save the session").on_click(self._save)
+        gui.add_button("Save the session").on_click(self._queued(self._save))
         upload = gui.add_upload_button("Load and play a session", mime_type="application/json")
-        upload.on_upload(self._load)
+        upload.on_upload(self._queued(self._play_file))
         self._on_press(gui.add_button("Begin a new session"), self._begin)
         self._saved_text = gui.add_html("")
 
+    def _queued(self, work: Callable[[Any], None]) -> Callable[[Any], Any]:
+        """A handler of events that leaves the work to the simulation's thread."""
+
+        async def handle(event: Any) -> None:
+            self._live.do(lambda: work(event))
+
+        return handle
+
     def _on_press(self, button: Any, work: Callable[[], None]) -> None:
-        async def pressed(_: Any) -> None:
-            self._live.do(work)
+        button.on_click(self._queued(lambda _: work()))
 
-        button.on_click(pressed)
+    def _add_buttons(self, gui: Any, name: str, works: dict[str, Callable[[], None]]) -> None:
+        group = gui.add_button_group(name, tuple(works))
 
-    def _on_press_of(self, group: Any, works: dict[str, Callable[[], None]]) -> None:
         async def pressed(_: Any) -> None:
             if group.value in works:
                 self._live.do(works[group.value])
 
         group.on_click(pressed)
+
+    def _on_changes(self, handles: list[Any], known: tuple[Any, ...], made: Callable[[], Event]) -> None:
+        """Applies the event that all values together make when one of them is changed."""
+
+        def changed(_: object) -> None:
+            event = made()
+            self._live.do(lambda: self._live.act(event))
+
+        for handle in handles:
+            self._on_change(handle, known, changed)
 
     @staticmethod
     def _on_change(handle: Any, known: tuple[Any, ...], work: Callable[[Any], None]) -> None:
@@ -234,7 +233,7 @@ class Page:
 
     def _calm(self) -> None:
         """Sets the sliders of wind and gravity to zero and restarts the colour scales."""
-        self._forget_scales()
+        self._painter.forget()
         for strength in self._strengths:
             strength.value = 0.0
 
@@ -250,20 +249,17 @@ class Page:
 
     def _recolour(self, mode: str) -> None:
         self.mode = mode
-        self._forget_scales()
+        self._painter.forget()
         self._repaint()
 
     def _selected(self) -> None:
         self._chosen.content = _small(f"Selected: {self._pointer.described()}.")
         self._repaint()
 
-    async def _save(self, event: Any) -> None:
-        self._live.do(lambda: self._save_for(event.client))
-
-    def _save_for(self, client: Any) -> None:
+    def _save(self, event: Any) -> None:
         session = self._live.interaction.session()
         name = f"session_{datetime.now():%Y%m%d_%H%M%S}_{len(self.saved):03d}.json"
-        path = self._sessions / name
+        path = self._subject.sessions / name
         try:
             save_session(session, path)
         except OSError as error:
@@ -271,14 +267,11 @@ class Page:
             return
         self.saved.append(path)
         self._saved_text.content = _small(f"Saved {path} ({session.steps} frames, {len(session.entries)} events).")
-        if client is not None:
-            client.send_file_download(name, path.read_bytes(), save_immediately=True)
+        if event.client is not None:
+            event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
 
-    async def _load(self, event: Any) -> None:
-        self._live.do(lambda: self._play_file(event.target.value.content))
-
-    def _play_file(self, content: bytes) -> None:
-        self._live.replay(parse_session(content, "the file"))
+    def _play_file(self, event: Any) -> None:
+        self._live.replay(parse_session(event.target.value.content, "the file"))
         self._start_over()
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -19,8 +20,7 @@ from trimesh.visual.material import PBRMaterial
 from viser.transforms import SO3
 
 from gausim.interaction.selections import Kernels, Selected, Unit, Whole
-from gausim.interaction.session import Force, Impulse, Release
-from gausim.viewer.grab import Grab
+from gausim.interaction.session import Force, Hand, Impulse, Release
 from gausim.viewer.live import Live
 from gausim.viewer.shown import Shown
 from gausim.viewer.splats import SIZE, Placing, unit_centres
@@ -30,6 +30,18 @@ WHOLE = "The whole object"
 _FOLLOWS = 8.0
 # Duration of the force of which a drag with the control key gives the impulse [s].
 _FLICK = 0.1
+# Time in which a hand follows the pointer or its slider [s].
+HAND_SECONDS = 0.15
+
+
+@dataclass
+class _Grab:
+    """A hand that a pointer drags, from the beginning of the drag."""
+
+    hand: int  # its number
+    point: Tensor  # where the drag began (3,) [page units]
+    # its displacement and turn then; asked for by the simulation's thread at the first motion
+    place: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
 
 
 class Pointer:
@@ -44,17 +56,15 @@ class Pointer:
         hand_moved: called with the number of a hand that is dragged and its displacement from rest [scene units].
     """
 
-    def __init__(
-        self, server: Any, live: Live, placing: Placing, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]
-    ) -> None:
+    def __init__(self, server: Any, live: Live, placing: Placing) -> None:
         """Creates a handle on every unit of the initial level."""
         self._server, self._live, self._placing = server, live, placing
-        scene = live.interaction.scene
+        scene, units, masses = live.interaction.scene, live.interaction.units, live.interaction.masses
         self._free = (scene.simulated & ~scene.pinned).cpu()
         hand = live.interaction.hand
         self._hand = torch.full((scene.count,), -1) if hand is None else hand.cpu()
         self._pins = pin_groups(self._hand, units[0].cpu() if units else torch.zeros_like(self._hand))
-        self._grabs: dict[int, Grab] = {}  # by client
+        self._grabs: dict[int, _Grab] = {}  # by client
         self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
         self._moved = 0.0
         self._pick: Any = None
@@ -134,10 +144,12 @@ class Pointer:
 
     def select(self, on: Selected | None) -> None:
         """Selects a part, or none."""
-        scene = self._live.interaction.scene
-        self.mask = torch.zeros_like(self._free) if on is None else on.mask(scene, self._units).cpu() & self._free
+        self.mask = torch.zeros_like(self._free) if on is None else self._mask(on)
         self.selection = on
         self.notice()
+
+    def _mask(self, on: Selected) -> Bool[Tensor, " K"]:
+        return on.mask(self._live.interaction.scene, self._units).cpu() & self._free
 
     def described(self) -> str:
         """Description of the selection for the page."""
@@ -170,16 +182,14 @@ class Pointer:
         numbers = inside.nonzero()[:, 0].tolist()
         self.select(Kernels(tuple(numbers)) if numbers else None)
 
-    def _grab(self, event: Any) -> Grab | None:
+    def _grab(self, event: Any) -> _Grab | None:
         """The hand whose pin a drag began on; None elsewhere."""
         if event.phase == "start" and self._page is not None:
             self._grabs.pop(event.client_id, None)
-            point = torch.tensor([float(v) for v in event.start_position])
+            point = vector(event.start_position)
             hand = self._hand_under(event, self._page, point)
             if hand >= 0:
-                self._grabs[event.client_id] = Grab(
-                    hand, point, self._placing.scale, lambda *place: self.hand_moved(*place)
-                )
+                self._grabs[event.client_id] = _Grab(hand, point)
         found = self._grabs.get(event.client_id)
         if event.phase == "end":
             self._grabs.pop(event.client_id, None)
@@ -191,18 +201,28 @@ class Pointer:
         if index is not None and index >= len(self._movable):
             found = self._hand[self._pins == index - len(self._movable)]
             return int(found[0]) if len(found) else -1
-        eye = torch.tensor([float(v) for v in event.client.camera.position])
+        eye = vector(event.client.camera.position)
         kernel = first_hit(page, self._reach, eye, point - eye, self._free | (self._hand >= 0))
         return -1 if kernel is None else int(self._hand[kernel])
 
-    def _drag_hand(self, grab: Grab, event: Any) -> None:
-        end = event.end_position
-        self._live.do(lambda: self._live.act(grab.event(self._live.interaction, end)))
+    def _drag_hand(self, grab: _Grab, event: Any) -> None:
+        """Moves a hand as far as the pointer has gone since the drag began; it keeps the turn that it had."""
+        interaction = self._live.interaction
+        way = (vector(event.end_position) - grab.point) / self._placing.scale
+
+        def move() -> None:
+            if grab.place is None:
+                grab.place = interaction.place_of_hand(grab.hand)
+            start, turn = grab.place
+            x, y, z = (torch.tensor(start) + way).tolist()
+            self.hand_moved(grab.hand, (x, y, z))
+            self._live.act(Hand((x, y, z), max(1, round(HAND_SECONDS * interaction.fps)), turn, grab.hand))
+
+        self._live.do(move)
         if event.phase == "end":
             self._label.visible = False
         else:
-            size = float(grab.drag(end).norm()) / self._live.interaction.scene.diagonal
-            self._point(event, f"hand {grab.hand}: {size:.2f} diagonals")
+            self._point(event, f"hand {grab.hand}: {float(way.norm()) / interaction.scene.diagonal:.2f} diagonals")
 
     def _grasp(self, event: Any) -> None:
         """Selects the unit under a drag's start unless the selection overlaps it."""
@@ -210,8 +230,7 @@ class Pointer:
         if event.phase != "start" or index is None or not 0 <= index < len(self._movable):
             return
         chosen = self._part(int(self._movable[index]))
-        mask = chosen.mask(self._live.interaction.scene, self._units).cpu() & self._free
-        if not bool((mask & self.mask).any()):
+        if not bool((self._mask(chosen) & self.mask).any()):
             self.select(chosen)
 
     def pull(self, start: Sequence[float], end: Sequence[float]) -> tuple[tuple[float, float, float], float]:
@@ -252,6 +271,11 @@ class Pointer:
             self._label.position, self._label.text, self._label.visible = event.end_position, text, True
 
 
+def vector(numbers: Iterable[float]) -> Float[Tensor, " 3"]:
+    """A point or direction of the page as the browser, numpy or torch gives it."""
+    return torch.tensor([float(number) for number in numbers])
+
+
 @cache
 def invisible_handle() -> bytes:
     """A binary glTF of a transparent icosahedron of radius 1, a target for the pointer.
@@ -275,13 +299,13 @@ def pin_groups(hand: Int[Tensor, " K"], units: Int[Tensor, " K"]) -> Int[Tensor,
 def first_hit(
     points: Float[Tensor, "K 3"],
     reach: Float[Tensor, " K"],
-    origin: Sequence[float] | Tensor,
-    direction: Sequence[float] | Tensor,
+    origin: Iterable[float],
+    direction: Iterable[float],
     among: Bool[Tensor, " K"],
 ) -> int | None:
     """The first kernel of the mask ``among`` whose centre is within its ``reach`` of a ray, or None."""
-    along = torch.nn.functional.normalize(points.new_tensor([float(v) for v in direction]), dim=0)
-    away = points - points.new_tensor([float(v) for v in origin])
+    along = torch.nn.functional.normalize(vector(direction), dim=0)
+    away = points - vector(origin)
     depth = away @ along
     passed = (away - depth[:, None] * along).norm(dim=-1)
     hit = (among & (depth > 0) & (passed <= reach)).nonzero()[:, 0]
@@ -297,7 +321,7 @@ def in_rectangle(
     [rad] and the aspect (width / height).
     """
     rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
-    seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation
+    seen = (points - vector(camera.position)) @ rotation
     half = math.tan(float(camera.fov) / 2)
     depth = seen[:, 2].clamp_min(1e-6)
     across = 0.5 + 0.5 * seen[:, 0] / (depth * half * float(camera.aspect))

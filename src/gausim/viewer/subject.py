@@ -17,7 +17,7 @@ from gausim.data.records import SequenceRecord
 from gausim.interaction.interaction import Interaction
 from gausim.models.template.template import Property
 from gausim.render.draw import SceneAppearance, draw, to_bytes
-from gausim.viewer.companion import Companion
+from gausim.viewer.live import Companion
 from gausim.viewer.shown import Shown, Take
 
 # Number of decoded frames in the cache.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
+from gausim.render.cpu.batch import ranges
 from gausim.render.cpu.shading import shade, shade_adjoint
 from gausim.render.cpu.simd import LANES
 from gausim.render.draw import deformed_appearance as operation
@@ -50,12 +51,6 @@ def _lanes(rows: Tensor) -> Any:
     return np.ascontiguousarray(padded.reshape(blocks, LANES, -1).transpose(0, 2, 1))
 
 
-def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
-    parts = max(1, -(-tasks // states))
-    edges = [i * blocks // parts for i in range(parts + 1)]
-    return list(zip(edges, edges[1:], strict=False))
-
-
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, positions: Tensor, deformation_gradients: Tensor, rotations: Tensor, *rest: Any) -> Any:
@@ -65,7 +60,7 @@ class _Shade(torch.autograd.Function):
         fixed = array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, array(centers)
         out_covars = np.empty((states, count, 3, 3), np.float32)
         out_colors = np.empty((states, centers.shape[0], count, 3), np.float32)
-        cuts = _cuts(fixed[1].shape[0], FORWARD_TASKS, states)
+        cuts = ranges(fixed[1].shape[0], max(1, -(-FORWARD_TASKS // states)))
 
         def task(item: tuple[int, tuple[int, int]]) -> None:
             b, part = item
@@ -83,7 +78,7 @@ class _Shade(torch.autograd.Function):
         positions, deformation_gradients, _ = ctx.saved_tensors
         states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
         given = array(grad_covars), array(grad_colors)
-        cuts = _cuts(fixed[1].shape[0], BACKWARD_TASKS, states)
+        cuts = ranges(fixed[1].shape[0], max(1, -(-BACKWARD_TASKS // states)))
         moved = np.empty(positions.shape, np.float32)
         of_units = np.zeros((2, states, len(cuts), *deformation_gradients.shape[1:]), np.float32)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +23,7 @@ Array = NDArray[Any]
 TASKS = 12
 # [tiles] Selecting a tile's kernels reads all kernels of its strip in the band: the cost is quadratic in the height.
 BAND_TILES = 8
+ALONE = WorkerPool(1)  # runs tasks in the thread that calls it
 
 
 class Images(NamedTuple):
@@ -45,17 +48,11 @@ class Gradients(NamedTuple):
     background: Array | None
 
 
-@dataclass(slots=True)
-class Band:
+class Band(NamedTuple):
     """Results for one band of one view that the backward pass needs."""
 
-    row_low: int
-    records: Array
-    entries: Array
-    start: Array
-    final: Array
-    last: Array
-    used: Array
+    kernels: tuple[Array, Array, Array, int]  # of bin_band: records, entries and their start; the first pixel row
+    seen: tuple[Array, Array, Array]  # of forward_band: final, last, used
 
 
 @dataclass(slots=True)
@@ -74,16 +71,11 @@ class View:
 
     def make_sums(self) -> None:
         """Allocates the sums of the backward pass, all bands in one array."""
-        rows = [0 if band is None else band.records.shape[0] for band in self.bands]
-        self.offsets = np.cumsum([0, *rows])
+        self.offsets = np.cumsum([0, *(band.kernels[0].shape[0] for band in self.bands if band is not None)])
         self.sums = np.empty((self.offsets[-1], SUMS), np.float32)
 
-    def forget(self) -> None:
-        """Frees arrays that only the forward pass needs."""
-        self.records = self.extents = self.order = None
 
-
-@dataclass(slots=True)
+@dataclass
 class Batch:
     """Inputs of one call as C-contiguous float32 arrays, and its options."""
 
@@ -100,21 +92,21 @@ class Batch:
     alpha_max: Any  # np.float32: the kernels are compiled for that type
     views: dict[tuple[int, int], View] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def pairs(self) -> list[tuple[int, int]]:
         """State and view of every image."""
         states, views = self.viewmats.shape[:2]
         return [(b, v) for b in range(states) for v in range(views)]
 
-    @property
+    @cached_property
     def band_rows(self) -> list[tuple[int, int]]:
         """First and last pixel row of each band of a view."""
         tile_rows = -(-self.height // TILE_HEIGHT)
         bands = min(tile_rows, max(_parts(len(self.pairs)), -(-tile_rows // BAND_TILES)))
-        cuts = [i * tile_rows // bands * TILE_HEIGHT for i in range(bands + 1)]
-        return [(low, min(high, self.height) - 1) for low, high in zip(cuts, cuts[1:], strict=False)]
+        cuts = [(low * TILE_HEIGHT, high * TILE_HEIGHT) for low, high in ranges(tile_rows, bands)]
+        return [(low, min(high, self.height) - 1) for low, high in cuts]
 
-    @property
+    @cached_property
     def band_of_row(self) -> Array:
         """The band of each pixel row."""
         return np.repeat(np.arange(len(self.band_rows)), [last - first + 1 for first, last in self.band_rows])
@@ -122,101 +114,85 @@ class Batch:
     def forward(self, pool: WorkerPool, *, keep: bool, depth: bool) -> Images:
         """Draws all images; ``keep`` stores the bands for the backward pass."""
         shape = (*self.viewmats.shape[:2], self.height, self.width)
-        images = Images(
-            np.empty((*shape, 3), np.float32),
-            np.empty(shape, np.float32),
-            np.empty(shape, np.float32) if depth else None,
-        )
-        bands, kernels = range(len(self.band_rows)), self.kernel_ranges(len(self.pairs))
+        rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+        images = Images(rgb, alpha, np.empty(shape, np.float32) if depth else None)
+        bands, kernels = range(len(self.band_rows)), ranges(self.means.shape[1], _parts(len(self.pairs)))
+
+        def sort(item: tuple[int, int]) -> None:
+            view = self.views[item]
+            view.order = depth_order(view.depth, view.spans)
 
         def draw(item: tuple[int, int, int]) -> None:
             b, v, index = item
             band = self.bin(b, v, index)
-            self.composite(band, images.of(b, v))
+            forward_band(*band.kernels, self.background, self.alpha_max, *images.of(b, v), *band.seen)
             self.views[b, v].bands[index] = band if keep else None
 
-        def draw_image(item: tuple[int, int]) -> None:
-            for low, high in kernels:
-                self.project((*item, low, high))
-            self.sort(item)
-            for index in bands:
-                draw((*item, index))
-            self.views[item].forget()
+        def draw_all(pairs: Sequence[tuple[int, int]], run: Callable[..., None]) -> None:
+            run(self.project, [(*item, *part) for item in pairs for part in kernels])
+            run(sort, pairs)
+            run(draw, [(*item, i) for item in pairs for i in bands])
+            for item in pairs:  # what only the forward pass needs
+                self.views[item].records = self.views[item].extents = self.views[item].order = None
 
-        self.make_views()
+        for item in self.pairs:
+            self.views[item] = self.new_view()
         if len(self.pairs) >= TASKS:
-            pool.run(draw_image, self.pairs)
-            return images
-        pool.run(self.project, [(*item, *part) for item in self.pairs for part in kernels])
-        pool.run(self.sort, self.pairs)
-        pool.run(draw, [(*item, i) for item in self.pairs for i in bands])
-        for view in self.views.values():
-            view.forget()
+            pool.run(lambda item: draw_all([item], ALONE.run), self.pairs)
+        else:
+            draw_all(self.pairs, pool.run)
         return images
 
     def backward(self, pool: WorkerPool, grads: Images, *, background: bool) -> Gradients:
         """Loss gradients of the inputs from those of the images."""
-        states, views = self.viewmats.shape[:2]
-        count, bands = self.means.shape[1], range(len(self.band_rows))
-        result = self.make_gradients(background=background)
-
-        def composite(item: tuple[int, int, int]) -> None:
-            self.composite_adjoint(item, grads, result.background)
-
-        def finish(part: tuple[int, int, int]) -> None:
-            for v in range(views):
-                self.project_adjoint(v, part, result)
-
-        def state(b: int) -> None:
-            for v in range(views):
-                self.views[b, v].make_sums()
-                for i in bands:
-                    composite((b, v, i))
-                self.project_adjoint(v, (b, 0, count), result)
-                self.views[b, v].sums = None
-
-        if states >= TASKS:  # the sums stay in the cache
-            pool.run(state, range(states))
-        else:
-            for view in self.views.values():
-                view.make_sums()
-            pool.run(composite, [(*item, i) for item in self.pairs for i in bands])
-            pool.run(finish, [(b, *part) for b in range(states) for part in self.kernel_ranges(states)])
-            for view in self.views.values():
-                view.sums = None
-        if result.background is None:
-            return result
-        return result._replace(background=result.background.sum((0, 1, 2)).astype(np.float32))
-
-    def make_gradients(self, *, background: bool) -> Gradients:
-        """Loss gradients of zero, to be added to; that of the background has one row per band."""
         (states, views), count = self.viewmats.shape[:2], self.means.shape[1]
-        return Gradients(
+        bands, kernels = range(len(self.band_rows)), ranges(count, _parts(states))
+        result = Gradients(
             np.zeros((states, count, 3), np.float32),
             np.zeros((states, count, 3, 3), np.float32),
             np.empty((states, views, count, 3), np.float32),
             np.zeros((states, count), np.float32),
-            np.zeros((states, views, len(self.band_rows), 3), np.float64) if background else None,
+            np.zeros((states, views, len(bands), 3), np.float64) if background else None,
         )
 
-    def kernel_ranges(self, images: int) -> list[tuple[int, int]]:
-        """Ranges of the kernels of each of ``images`` views or states; all of them together make about TASKS tasks."""
-        count, parts = self.means.shape[1], _parts(images)
-        cuts = [i * count // parts for i in range(parts + 1)]
-        return [(low, high) for low, high in zip(cuts, cuts[1:], strict=False) if high > low]
+        composite = partial(self.composite_adjoint, grads, result.background)
 
-    def make_views(self) -> None:
-        """Allocates the results of the forward pass."""
+        def adjoint(of_states: Sequence[int], of_views: Sequence[int], run: Callable[..., None]) -> None:
+            def finish(part: tuple[int, int, int]) -> None:
+                for v in of_views:
+                    self.project_adjoint(v, part, result)
+
+            pairs = [(b, v) for b in of_states for v in of_views]
+            for item in pairs:
+                self.views[item].make_sums()
+            run(composite, [(*item, i) for item in pairs for i in bands])
+            run(finish, [(b, *part) for b in of_states for part in kernels])
+            for item in pairs:
+                self.views[item].sums = None
+
+        def one_by_one(b: int) -> None:
+            for v in range(views):
+                adjoint([b], [v], ALONE.run)
+
+        if states >= TASKS:  # the sums stay in the cache
+            pool.run(one_by_one, range(states))
+        else:
+            adjoint(range(states), range(views), pool.run)
+        if result.background is None:
+            return result
+        return result._replace(background=result.background.sum((0, 1, 2)).astype(np.float32))
+
+    def new_view(self) -> View:
+        """A view whose arrays the forward pass fills."""
         count, bands = self.means.shape[1], len(self.band_rows)
-        for item in self.pairs:
-            self.views[item] = View(
-                depth=np.empty(count, np.float32),
-                row_of=np.empty((bands, count), np.int32),
-                records=np.empty((count, RECORD), np.float32),
-                extents=np.empty((count, EXTENT), np.float32),
-                spans=np.empty((count, 2), np.int32),
-                bands=[None] * bands,
-            )
+        return View(
+            depth=np.empty(count, np.float32),
+            row_of=np.empty((bands, count), np.int32),
+            records=np.empty((count, RECORD), np.float32),
+            extents=np.empty((count, EXTENT), np.float32),
+            spans=np.empty((count, 2), np.int32),
+            bands=[None] * bands,
+        )
 
     def project(self, part: tuple[int, int, int, int]) -> None:
         """Projects kernels ``low .. high - 1`` of state b into view v; ``part`` = (b, v, low, high).
@@ -238,10 +214,6 @@ class Batch:
             view.records, view.extents, view.spans, view.depth,
         )  # fmt: skip
 
-    def sort(self, item: tuple[int, int]) -> None:
-        """Orders the kernels of a view by depth."""
-        self.views[item].order = depth_order(self.views[item].depth, self.views[item].spans)
-
     def bin(self, b: int, v: int, index: int) -> Band:
         """Lists the kernels of every tile of a band."""
         view, rows = self.views[b, v], self.band_rows[index]
@@ -251,26 +223,17 @@ class Batch:
         )  # fmt: skip
         tiles = start.shape[0] - 1
         final, last = np.empty((tiles, PIXELS), np.float32), np.empty((tiles, PIXELS), np.float32)
-        return Band(rows[0], records, entries, start, final, last, np.empty((tiles, BLOCKS + 1), np.int64))
+        return Band((records, entries, start, rows[0]), (final, last, np.empty((tiles, BLOCKS + 1), np.int64)))
 
-    def composite(self, band: Band, images: tuple[Array, Array, Array | None]) -> None:
-        """Draws a band into the images of its view."""
-        forward_band(
-            band.records, band.entries, band.start, band.row_low, self.background, self.alpha_max, *images, band.final,
-            band.last, band.used,
-        )  # fmt: skip
-
-    def composite_adjoint(self, item: tuple[int, int, int], grads: Images, background: Array | None) -> None:
+    def composite_adjoint(self, grads: Images, background: Array | None, item: tuple[int, int, int]) -> None:
         """Sums the loss gradients of a band's pixels for each of its kernels; ``item`` = (b, v, band)."""
         b, v, index = item
         view = self.views[b, v]
         band, sums, offsets = view.bands[index], view.sums, view.offsets
         assert band is not None and sums is not None and offsets is not None
-        rgb, alpha, depth = grads.of(b, v)
         backward_band(
-            band.records, band.entries, band.start, band.row_low, self.background, self.alpha_max, rgb, alpha, depth,
-            band.final, band.last, band.used, sums[offsets[index] : offsets[index + 1]],
-            None if background is None else background[item],
+            *band.kernels, self.background, self.alpha_max, *grads.of(b, v), *band.seen,
+            sums[offsets[index] : offsets[index + 1]], None if background is None else background[item],
         )  # fmt: skip
 
     def project_adjoint(self, v: int, part: tuple[int, int, int], grads: Gradients) -> None:
@@ -285,4 +248,11 @@ class Batch:
 
 
 def _parts(images: int) -> int:
+    """Parts of the work on each of ``images`` views or states; all of them together make about TASKS tasks."""
     return max(1, -(-TASKS // images))
+
+
+def ranges(count: int, parts: int) -> list[tuple[int, int]]:
+    """The numbers from 0 to ``count`` in ranges of about one size, each with its first and one past its last."""
+    cuts = [i * count // parts for i in range(parts + 1)]
+    return [(low, high) for low, high in zip(cuts, cuts[1:], strict=False) if high > low]

@@ -24,24 +24,13 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, background: Tensor, *rest: Any
     ) -> Any:
-        pool, keep, depth, viewmats, Ks, size, near, alpha_max = rest
-        batch = Batch(
-            means=array(means),
-            covars=array(covars),
-            colors=array(colors),
-            opacities=array(opacities),
-            viewmats=array(viewmats),
-            Ks=array(Ks),
-            background=array(background),
-            width=size[0],
-            height=size[1],
-            near=near,
-            alpha_max=np.float32(alpha_max),
-        )
+        pool, keep, depth, viewmats, Ks, *options = rest
+        arrays: Any = map(array, (means, covars, colors, opacities, viewmats, Ks, background))
+        batch = Batch(*arrays, *options)
         images = batch.forward(pool, keep=keep, depth=depth)
         if keep:
             ctx.save_for_backward(means, covars, colors, opacities, background)
-            ctx.batch, ctx.pool, ctx.depth = batch, pool, depth
+            ctx.batch, ctx.pool = batch, pool
             ctx.set_materialize_grads(False)
         return tuple(None if image is None else torch.from_numpy(image) for image in images)
 
@@ -59,7 +48,7 @@ class _Render(torch.autograd.Function):
         grads = batch.backward(ctx.pool, images, background=needed[4])
         return (
             *(torch.from_numpy(grad) if need else None for grad, need in zip(grads, needed, strict=True)),
-            *[None] * 8,
+            *[None] * 9,
         )
 
 
@@ -115,16 +104,7 @@ class CpuRenderer:
         behind = torch.from_numpy(np.zeros(3, np.float32)) if background is None else background.to(means)
         inputs["background"] = behind
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
+        pool = shared_pool(self.threads or torch.get_num_threads())
+        options = (*size, self.near, np.float32(self.alpha_max))
         with announced("the CPU renderer"):
-            images = _Render.apply(
-                *inputs.values(),
-                shared_pool(self.threads or torch.get_num_threads()),
-                keep,
-                depth,
-                viewmats,
-                Ks,
-                size,
-                self.near,
-                self.alpha_max,
-            )
-        return Rendered(*images)
+            return Rendered(*_Render.apply(*inputs.values(), pool, keep, depth, viewmats, Ks, *options))

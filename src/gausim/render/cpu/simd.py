@@ -39,7 +39,7 @@ class _LanesModel(models.PrimitiveModel):
 
 def _spread(builder, kind, value):
     """A vector from either a vector or a float32."""
-    if kind == vector:
+    if isinstance(kind, _Lanes):
         return value
     one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(_I32, 0))
     return _shuffle(builder, one, one, [0] * LANES)
@@ -50,9 +50,11 @@ def _shuffle(builder, a, b, picks):
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(picks)), list(picks)))
 
 
-def _binary(symbol, result, emit) -> None:
+_PAIRS = (vector, vector), (vector, types.float32), (types.float32, vector)
+
+
+def _binary(symbol, result, emit, pairs=_PAIRS) -> None:
     """Registers the operator ``symbol`` between two vectors, or a vector and a float32."""
-    pairs = (vector, vector), (vector, types.float32), (types.float32, vector)
 
     @infer_global(symbol)
     class _Template(ConcreteTemplate):
@@ -78,14 +80,7 @@ for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<
     _binary(_symbol, mask, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
 
 
-@infer_global(operator.and_)
-class _And(ConcreteTemplate):
-    cases = [signature(mask, mask, mask)]
-
-
-@lower_builtin(operator.and_, mask, mask)
-def _lower_and(context, builder, sig, args):
-    return builder.and_(*args)
+_binary(operator.and_, mask, ir.IRBuilder.and_, [(mask, mask)])
 
 
 def _pointer(context, builder, kind, array, index):
