@@ -24,8 +24,7 @@ from gausim.metrics.lpips import expected_shapes
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.pictures import load_pictures
 from gausim.runs import cost
-from gausim.runs.cost import CostMeter
-from gausim.runs.memory import keep_freed_memory
+from gausim.runs.cost import CostMeter, keep_freed_memory
 from gausim.runs.provenance import code_provenance
 
 

@@ -1,28 +1,26 @@
+"""The image losses against kornia and formulas, with gradients, and the objective."""
+
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from kornia.losses import ssim_loss
 from kornia.metrics import ssim
+from torch import Tensor
 
 from gausim.core import ConfigError
 from gausim.losses import ImageLoss, Objective, static_loss, structural_similarity
 from gausim.losses.image import gaussian_taps
+from gausim.losses.mixed import MixedLoss
 
 
-def images(batch: int = 3, height: int = 17, width: int = 23) -> tuple[torch.Tensor, torch.Tensor]:
+def images(batch: int = 3, height: int = 17, width: int = 23, channels: int = 3) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
-    shape = (batch, 2, height, width, 3)
+    shape = (batch, 2, height, width, channels)
     return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
-
-
-def framed(x: torch.Tensor) -> torch.Tensor:
-    """The image on a black canvas that is much larger and where it stands off the centre."""
-    canvas = torch.zeros(*x.shape[:2], 48, 40, 3)
-    canvas[:, :, 9 : 9 + x.shape[2], 6 : 6 + x.shape[3]] = x
-    return canvas
 
 
 @pytest.mark.parametrize("window", [5, 11])
@@ -106,8 +104,42 @@ def test_objective_windows_and_chances() -> None:
     assert [Objective(backprop_steps=k).window(6) for k in (0, 1, 4, 9)] == [6, 1, 4, 6]
 
 
-def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match="odd window"):
-        ImageLoss(window=4)
-    with pytest.raises(ConfigError, match="mixing_weight"):
-        Objective(mixing_weight=-1.0)
+def test_each_term_of_a_mixture_is_a_mean() -> None:
+    x, y = images(channels=4)
+    color = (x - y)[..., :3]
+    torch.testing.assert_close(MixedLoss(l1=2.0)(x[..., :3], y[..., :3]), 2 * color.abs().mean((1, 2, 3, 4)))
+    expected = 3 * color.square().mean((1, 2, 3, 4)) + 5 * (x - y)[..., 3].square().mean((1, 2, 3))
+    loss = MixedLoss(mse=3.0, alpha=5.0)
+    assert loss.compares_alpha and not MixedLoss(mse=1.0).compares_alpha
+    torch.testing.assert_close(loss(x, y), expected)
+
+
+def test_ssim_of_a_mixture_is_that_of_the_image_loss() -> None:
+    x, y = images()
+    other = ImageLoss(balance=0.0, window=5, pixels=1)  # (1 - SSIM) / 2, summed over channels
+    torch.testing.assert_close(MixedLoss(dssim=1.0, window=5)(x, y), 2 / 3 * other(x, y), rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_of_a_mixture_are_those_of_the_sum() -> None:
+    x, y = (v.double() for v in images(channels=4))
+    loss = MixedLoss(l1=0.3, mse=0.2, dssim=0.5, alpha=0.7, window=5)
+    values, gradient = loss.value_and_gradient(x, y)
+    leaf = x.clone().requires_grad_()
+    loss(leaf, y).sum().backward()
+    torch.testing.assert_close(leaf.grad, gradient)
+    step = 1e-6 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
+    torch.testing.assert_close((loss(x + step, y) - values).sum(), (gradient * step).sum(), rtol=1e-3, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda: ImageLoss(window=4), "odd window"),
+        (lambda: Objective(mixing_weight=-1.0), "mixing_weight"),
+        (lambda: MixedLoss(), "one of them > 0"),
+        (lambda: MixedLoss(dssim=1.0, window=19)(*images()), "23x17 pixels.*window of 19"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong: Callable[[], object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        wrong()

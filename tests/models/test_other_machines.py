@@ -27,7 +27,7 @@ def made() -> GausSimModule:
 def rolled(module: GausSimModule) -> Tensor:
     samples = [sample(0), sample(0)]
     batch = module.simulator.batch([0, 0])
-    ((_, steps),) = windows(module.simulator, batch, module.initial(samples, batch), 4, 4)
+    ((_, steps),) = windows(module.simulator, batch, module.method.initial(samples, batch), 4, 4)
     return torch.stack([step.positions for step in steps])
 
 

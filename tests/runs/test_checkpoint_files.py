@@ -38,6 +38,15 @@ def checkpoint(value: float = 1.0) -> dict:
     return {"state_dict": {"weight": torch.full((2, 3), value)}, "gausim": own}
 
 
+def _no_space(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def weight(path: Path) -> float:
+    """The constant of a written :func:`checkpoint`."""
+    return float(read_checkpoint(path)["state_dict"]["weight"][0, 0])
+
+
 def test_written_and_read_without_running_code(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
@@ -51,35 +60,26 @@ def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
 ) -> None:
     path = tmp_path / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     with monkeypatch.context() as patch:
-        patch.setattr(failing, refuse)
+        patch.setattr(failing, _no_space)
         with pytest.raises(RunError, match=rf"last\.ckpt: .* could not be written .*{os.strerror(errno.ENOSPC)}"):
             AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
     # Only where the name was taken already, and its entry in the directory could not be flushed, is it the new one.
-    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == (3.0 if failing == "os.open" else 2.0)
+    assert weight(path) == (3.0 if failing == "os.open" else 2.0)
     assert list(tmp_path.glob(".*")) == []
 
 
-def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize("links", [True, False])
+def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(
+    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not links:
+        monkeypatch.setattr(os, "link", _no_space)
     for value in (1.0, 2.0, 3.0):
         for name in ("last.ckpt", "epoch_0001.ckpt"):
             AtomicCheckpointIO().save_checkpoint(checkpoint(value), tmp_path / name)
-    kept = {p.name: float(read_checkpoint(p)["state_dict"]["weight"][0, 0]) for p in tmp_path.iterdir()}
+    kept = {p.name: weight(p) for p in tmp_path.iterdir()}
     assert kept == {"last.ckpt": 3.0, "last.previous.ckpt": 2.0, "epoch_0001.ckpt": 3.0}
-
-
-def test_without_hard_links_the_predecessor_is_kept_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EPERM, "no hard links here")
-
-    monkeypatch.setattr(os, "link", refuse)
-    for value in (1.0, 2.0):
-        AtomicCheckpointIO().save_checkpoint(checkpoint(value), tmp_path / "last.ckpt")
-    assert float(read_checkpoint(tmp_path / "last.previous.ckpt")["state_dict"]["weight"][0, 0]) == 1.0
 
 
 def test_what_reads_back_differently_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +89,7 @@ def test_what_reads_back_differently_is_not_kept(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(torch, "save", lambda obj, file: save(checkpoint(9.0), file))
     with pytest.raises(RunError, match="other contents"):
         AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
-    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == 2.0
+    assert weight(path) == 2.0
 
 
 def test_what_would_need_code_to_read_is_not_written(tmp_path: Path) -> None:
@@ -100,8 +100,8 @@ def test_what_would_need_code_to_read_is_not_written(tmp_path: Path) -> None:
 
 def damage(path: Path, how: str) -> None:
     whole = path.read_bytes()
-    weight = whole.index(torch.full((2, 3), 3.0).numpy().tobytes())
-    flipped = whole[: weight + 5] + bytes([whole[weight + 5] ^ 1]) + whole[weight + 6 :]
+    at = whole.index(torch.full((2, 3), 3.0).numpy().tobytes()) + 5
+    flipped = whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :]
     halves = {"truncated": whole[:-300], "empty": b"", "garbage": bytes(range(256)) * 40, "flipped": flipped}
     path.write_bytes(halves[how])
 
@@ -119,10 +119,10 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_it_serves(how: str, tmp
     with pytest.warns(UserWarning, match=names):
         resume = run.prepare({"seed": 0})
     assert resume == tmp_path / "last.previous.ckpt"
-    assert float(read_checkpoint(resume)["state_dict"]["weight"][0, 0]) == 2.0
+    assert weight(resume) == 2.0
     # The next save must not put the damaged file in the good one's place.
     AtomicCheckpointIO().save_checkpoint(checkpoint(4.0), run.checkpoint)
-    assert float(read_checkpoint(resume)["state_dict"]["weight"][0, 0]) == 2.0
+    assert weight(resume) == 2.0
     for path in (run.checkpoint, resume):
         path.write_bytes(b"")
     with pytest.raises(RunError, match=r"(?s)no checkpoint here is whole.*last\.ckpt.*last\.previous\.ckpt.*overwrite"):
@@ -138,7 +138,7 @@ def test_a_checkpoint_of_another_version_is_read_but_not_resumed(lacks: str, tmp
         AtomicCheckpointIO().save_checkpoint(other, run.checkpoint)
     else:
         torch.save(other, run.checkpoint)
-    assert float(read_checkpoint(run.checkpoint)["state_dict"]["weight"][0, 0]) == 5.0
+    assert weight(run.checkpoint) == 5.0
     with pytest.raises(RunError, match="another version"):
         run.prepare({"seed": 0})
 

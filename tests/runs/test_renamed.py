@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
+from typing import Any
 
 import pytest
 import yaml
@@ -53,8 +54,6 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
         {"diameter": 0.5, "edge_length": 2.0}, {"diameter": 0.2, "edge_length": 0.4},
     ]  # fmt: skip
     assert simulator["head"]["lever"] == 0.1 and simulator["rollout"]["energy_guard_frames"] == 4
-    image = {"_target_": "gausim.losses.image.ImageLoss", "window": 7}
-    assert with_present_names(image | {"crop": True}) == image
     model = instantiate(simulator, scenes=[toy_scene()], fps=[24.0])()
     assert model.predicted_levels == (2, 1)
     assert with_present_names(found) == found
@@ -76,54 +75,64 @@ def test_weights_of_before_are_read_by_present_names() -> None:
     }  # fmt: skip
 
 
-def test_the_number_of_modes_with_a_velocity_is_a_switch_now() -> None:
-    old = {"_target_": "gausim.models.initial_state.ModalInitialStates", "in_diagonals": True}
-    for modes, vibrations in ((27, True), (None, False)):
-        new = with_present_names({**old, "modes": modes})
-        assert new == {**old, "vibrations": vibrations} and with_present_names(new) == new
-    assert with_present_names(old) == old
+MODAL = {"_target_": "gausim.models.initial_state.ModalInitialStates", "in_diagonals": True}
+SOLID = {"_target_": "gausim.models.template.solid.SolidSettings", "spacing": 0.08}
+MATERIAL = {"_target_": "gausim.models.template.material.MaterialTemplate", "modes": 48, "solid": SOLID}
+OLD_ELASTIC = {
+    "_target_": "gausim.models.elastic.ElasticTemplate",
+    "modes": 8,
+    "solid": 0.12,
+    "hidden": 0,
+    "damping": "full",
+}
+FILLING = {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0}
+OLD_FILLING = {**FILLING, "ray_axis": 0, "open_side": None, "seed": 0}
+IMAGE = {"_target_": "gausim.losses.image.ImageLoss", "window": 7}
+FLOWS = {"_target_": "gausim.baselines.physgaussian.PhysGaussian", "material": "von_mises", "yield_stress": 1.0}
+POINTS = {
+    "_target_": "gausim.baselines.physdreamer.PhysDreamer", "particles": 8, "young_modulus": 1e5, "cells": 20,
+    "density": 2000.0, "modulus_scale": 1.0, "filling": FILLING,
+}  # fmt: skip
 
 
-def test_a_setting_that_moved_into_a_group_is_found_there() -> None:
-    solid = {"_target_": "gausim.models.template.solid.SolidSettings", "spacing": 0.08}
-    old = {"_target_": "gausim.models.template.material.MaterialTemplate", "modes": 48, "solid": solid}
-    new = with_present_names({**old, "free_modes": 2})
-    assert new == {**old, "solid": {**solid, "free_modes": 2}} and with_present_names(new) == new
-    assert with_present_names(old) == old
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (IMAGE | {"crop": True}, IMAGE),
+        (MODAL, MODAL),
+        (MODAL | {"modes": 27}, MODAL | {"vibrations": True}),
+        (MODAL | {"modes": None}, MODAL | {"vibrations": False}),
+        (MATERIAL, MATERIAL),
+        (MATERIAL | {"free_modes": 2}, MATERIAL | {"solid": SOLID | {"free_modes": 2}}),
+        (OLD_ELASTIC, {"_target_": ELASTIC, "modes": 8, "solid": 0.12}),
+        (OLD_FILLING, FILLING),
+    ],
+)
+def test_settings_that_moved_changed_or_went_are_read(old: dict[str, Any], new: dict[str, Any]) -> None:
+    assert with_present_names(old) == new and with_present_names(new) == new
 
 
-def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused() -> None:
-    old = {"_target_": "gausim.models.elastic.ElasticTemplate", "modes": 8, "solid": 0.12}
-    old |= {"hidden": 0, "damping": "full"}
-    assert with_present_names(old) == {"_target_": ELASTIC, "modes": 8, "solid": 0.12}
-    for name, value in {"damping": "rayleigh", "hidden": 64, "solid": None}.items():
-        with pytest.raises(ValueError, match=f"template.{name} is"):
-            with_present_names({**old, name: value})
+@pytest.mark.parametrize(
+    ("old", "said"),
+    [
+        (OLD_ELASTIC | {"damping": "rayleigh"}, "template.damping is"),
+        (OLD_ELASTIC | {"hidden": 64}, "template.hidden is"),
+        (OLD_ELASTIC | {"solid": None}, "template.solid is"),
+        (OLD_FILLING | {"ray_axis": 2}, "ray_axis is 2, which is no longer supported"),
+        (FLOWS, "no longer supported"),
+        (POINTS | {"gradients": False}, "gradients is False, which is no longer supported"),
+    ],
+)
+def test_settings_that_were_used_and_are_gone_are_refused(old: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        with_present_names(old)
 
 
 def test_the_settings_of_material_points_are_in_groups() -> None:
-    filling = {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0}
-    old = {
-        "_target_": "gausim.baselines.physdreamer.PhysDreamer", "particles": 8, "young_modulus": 1e5, "cells": 20,
-        "density": 2000.0, "modulus_scale": 1.0, "filling": filling,
-    }  # fmt: skip
-    new = with_present_names(old)
+    new = with_present_names(POINTS)
     assert set(new) == {"_target_", "particles", "material", "discretisation", "modulus"}
     assert new["material"] == {"_target_": "gausim.baselines.mpm.Material", "young_modulus": 1e5, "density": 2000.0}
-    assert new["discretisation"]["cells"] == 20 and new["discretisation"]["filling"] == filling
+    assert new["discretisation"]["cells"] == 20 and new["discretisation"]["filling"] == FILLING
     assert new["modulus"]["scale"] == 1.0
-    assert with_present_names(new) == new
-    flows = {"_target_": "gausim.baselines.physgaussian.PhysGaussian", "material": "von_mises", "yield_stress": 1.0}
-    with pytest.raises(ValueError, match="no longer supported"):
-        with_present_names(flows)
-    assert "yield_stress" not in with_present_names({**flows, "material": "fixed_corotated"})
-    assert with_present_names({**new, "gradients": True}) == new
-    with pytest.raises(ValueError, match="gradients is False, which is no longer supported"):
-        with_present_names({**new, "gradients": False})
-
-
-def test_settings_of_a_filling_that_are_gone_are_dropped_unless_they_were_used() -> None:
-    filling = {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0, "ray_axis": 0, "open_side": None, "seed": 0}
-    assert with_present_names(filling) == {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0}
-    with pytest.raises(ValueError, match="ray_axis is 2, which is no longer supported"):
-        with_present_names({**filling, "ray_axis": 2})
+    assert with_present_names(new) == new == with_present_names({**new, "gradients": True})
+    assert "yield_stress" not in with_present_names({**FLOWS, "material": "fixed_corotated"})

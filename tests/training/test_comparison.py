@@ -67,7 +67,7 @@ class Case:
         losses, motion = [], torch.zeros(()).double()
         for i, member in enumerate(self.batch.members):
             rows = member.kernels, member.units, member.units
-            states = [x[:, r] for x, r in zip(self.states.tensors(), rows, strict=True)]
+            states = [x[:, r] for x, r in zip(self.states, rows, strict=True)]
             look, cameras = self.looks[member.scene_id], toy_object.cameras()
             images = draw(ReferenceRenderer(), look, *states, member.unit_of_kernel, cameras).rgb
             losses.append(self.loss(images, composite(self.frames[i])[0]))
@@ -86,7 +86,7 @@ def test_chunks_give_what_one_graph_gives(pixels: int, monkeypatch: pytest.Monke
     torch.testing.assert_close(motion, moved.detach(), rtol=1e-12, atol=0)
     assert not motion.requires_grad
     weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(2)).double()
-    found, plain_ones = (torch.autograd.grad(x, case.states.tensors(), weights) for x in (losses, expected))
+    found, plain_ones = (torch.autograd.grad(x, case.states, weights) for x in (losses, expected))
     for ours, plain in zip(found, plain_ones, strict=True):
         assert float(plain.norm()) > 0
         assert float((ours - plain).norm()) <= 1e-6 * float(plain.norm())
@@ -96,7 +96,7 @@ def test_stretches_continue_where_the_last_one_ended() -> None:
     case = Case(steps=5)
     whole, motion = case.comparison()(case.states, 0)
     work = case.comparison()
-    parts = [work(States(*(x[span] for x in case.states.tensors())), span.start) for span in (slice(0, 2), slice(2, 5))]
+    parts = [work(States(*(x[span] for x in case.states)), span.start) for span in (slice(0, 2), slice(2, 5))]
     torch.testing.assert_close(torch.cat([losses for losses, _ in parts]), whole, rtol=1e-6, atol=0)
     torch.testing.assert_close(sum(m for _, m in parts), motion, rtol=1e-12, atol=0)
 
@@ -107,7 +107,7 @@ def test_no_image_is_held_for_the_backward_pass(monkeypatch: pytest.MonkeyPatch)
     for steps in (3, 12):
         case = Case(steps)
         held[steps] = peak_saved_bytes(lambda case=case: case.comparison(blobs)(case.states, 0))
-    states = sum(x[0].numel() * 8 for x in case.states.tensors())
+    states = sum(x[0].numel() * 8 for x in case.states)
     assert held[12] - held[3] <= 9 * states
     one_image = 8 * 3 * STATE
     assert states < one_image  # so the bound above tells states from images

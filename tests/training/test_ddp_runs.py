@@ -68,10 +68,9 @@ def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(trainings: Traini
     assert status == 0, output
     assert output.count("(2 ranks, ") == 2 and "sweep of 2 jobs: 2 trained" in output and "Traceback" not in output
     jobs = [marker.parent for marker in (trainings.folder / name).rglob("FINISHED")]
-    rates = {yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"] for job in jobs}
-    assert len(jobs) == len(rates) == 2
-    for job in jobs:  # what a run of its own learns with the job's rate: all ranks had it
-        rate = yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"]
+    rates = {job: yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"] for job in jobs}
+    assert len(jobs) == len(set(rates.values())) == 2
+    for job, rate in rates.items():  # what a run of its own learns with the job's rate: all ranks had it
         status, output = trainings(f"alone_{job.parent.name[-8:]}", *settings, f"optimizer.network_lr={rate}")
         assert status == 0, output
         assert_same_run(job, trainings.run(f"alone_{job.parent.name[-8:]}"))

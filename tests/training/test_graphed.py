@@ -69,17 +69,22 @@ def test_a_rollout_from_tensors_to_tensors_has_the_same_gradients(monkeypatch: p
         assert torch.equal(gradient, gradients.get(name, torch.zeros_like(gradient)))
 
 
+def traced(device: str, template: Any) -> tuple[_Stretch, list[Tensor], list[Tensor]]:
+    """Two steps of two members, their initial positions, and all that they are differentiated by."""
+    model = module_on("cpu", template=template, edges="rest").simulator.to(device)
+    batch = model.batch((0, 0))
+    given = [batch.rest.clone().requires_grad_() for _ in range(2)]
+    return _Stretch(model, batch, 2), given, [*given, *(p for p in model.parameters() if p.requires_grad)]
+
+
 @TEMPLATES
 def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(monkeypatch: pytest.MonkeyPatch, template: Any) -> None:
     """Preparation included, for a graph captures all three."""
-    model = module_on("cpu", template=template, edges="rest").simulator.to("meta")
-    batch = model.batch((0, 0))
-    stretch, given = _Stretch(model, batch, 2), [torch.empty_like(batch.rest).requires_grad_() for _ in range(2)]
+    stretch, given, trained = traced("meta", template)
     with asking_nothing(monkeypatch, watched=False):
         stretch(*given)  # what a batch keeps from its first use on
     with asking_nothing(monkeypatch):
         made = [x for x in stretch(*given) if x.requires_grad]
-        trained = [*given, *(p for p in model.parameters() if p.requires_grad)]
         found = torch.autograd.grad(made, trained, [torch.empty_like(x) for x in made], allow_unused=True)
     assert sum(gradient is not None for gradient in found) > len(trained) / 2
 
@@ -87,10 +92,7 @@ def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(monkeypatch: pyt
 @TEMPLATES
 def test_no_operation_of_a_backward_pass_reads_a_number(template: Any) -> None:
     """Of those within ATen, too, which tensors without values pass by: the gradient of a trace is one."""
-    model = module_on("cpu", template=template, edges="rest").simulator
-    batch = model.batch((0, 0))
-    stretch, given = _Stretch(model, batch, 2), [batch.rest.clone().requires_grad_() for _ in range(2)]
-    trained = [*given, *(p for p in model.parameters() if p.requires_grad)]
+    stretch, given, trained = traced("cpu", template)
     stretch(*given)  # what a batch keeps from its first use on
     with plain_forms(), profile(activities=[ProfilerActivity.CPU]) as seen:
         made = [x for x in stretch(*given) if x.requires_grad]

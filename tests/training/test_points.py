@@ -61,10 +61,15 @@ def plain(known: GroundTruth, made: States, member: int) -> Tensor:
     return trajectory.carry(known.rest, attach_points(SCENE, known.rest), SCENE.means)
 
 
+def compared(known: GroundTruth, made: States, members: int = 1, **options: float) -> tuple[Tensor, Tensor]:
+    """Losses and squared change of states of the first sequences, all T frames in one stretch."""
+    supervision = PointSupervision(sources(lambda number: known), **options)  # type: ignore[arg-type]
+    return supervision.comparison([sample(i, 5) for i in range(members)], batch(members))(made, 0)
+
+
 def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradients() -> None:
     known, made = truth(), states(4, 2)
-    work = PointSupervision(sources(lambda number: known)).comparison([sample(0, 5), sample(1, 5)], batch(2))
-    losses, motion = work(made, 0)
+    losses, motion = compared(known, made, 2)
     assert losses.shape == (4, 2) and not motion.requires_grad
     expected, moved = [], 0.0
     for member in range(2):
@@ -83,10 +88,9 @@ def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradien
 
 def test_stretches_continue_where_the_last_one_ended() -> None:
     known, made = truth(), states(5, 1)
-    supervision = PointSupervision(sources(lambda number: known))
-    whole, motion = supervision.comparison([sample(0, 5)], batch(1))(made, 0)
-    work = supervision.comparison([sample(0, 5)], batch(1))
-    parts = [work(States(*(x[s] for x in made.tensors())), s.start) for s in (slice(0, 2), slice(2, 5))]
+    whole, motion = compared(known, made)
+    work = PointSupervision(sources(lambda number: known)).comparison([sample(0, 5)], batch(1))
+    parts = [work(States(*(x[s] for x in made)), s.start) for s in (slice(0, 2), slice(2, 5))]
     torch.testing.assert_close(torch.cat([p[0] for p in parts]), whole)
     assert float(sum(p[1] for p in parts)) == pytest.approx(float(motion), rel=1e-6)
 
@@ -142,8 +146,7 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
 
 def test_energy_of_each_half_counts_by_its_logarithm_in_units_of_the_rest_state() -> None:
     known, made = truth(), states(5, 1)
-    both = (PointSupervision(sources(lambda number: known), energy_weight=w) for w in (0.0, 2.0))
-    plain_loss, weighted = (s.comparison([sample(0, 5)], batch(1))(made, 0)[0] for s in both)
+    plain_loss, weighted = (compared(known, made, energy_weight=weight)[0] for weight in (0.0, 2.0))
     percent = (100 / SCENE.diagonal) ** 2
     points = torch.cat((known.rest[None], plain(known, made, 0)))
     energy, true = (x.diff(dim=0).square().sum(-1).mean(1) for x in (points, known.positions[:6]))

@@ -18,6 +18,7 @@ from gausim.compose.build import build
 from gausim.compose.config import compose
 from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
+from gausim.data.pretraining import CorpusDataModule
 from gausim.evaluation.corpus import BodyFigures, summary
 from gausim.interaction.replay import replay as replay_session
 from gausim.interaction.selections import Whole
@@ -27,6 +28,8 @@ from gausim.io.trajectory import load_trajectory
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.template.material import MaterialTemplate
 from gausim.training.material_scan import DRAG, STIFFNESS, _coordinates, find_materials, known_motion
+from gausim.training.module import GausSimModule
+from gausim.training.rollout import States
 
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
@@ -41,8 +44,13 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_corpus(tmp_path_factory.mktemp("corpus"))
 
 
+def pretraining(corpus: Path, *choice: str) -> tuple[GausSimModule, CorpusDataModule]:
+    choice = choice or ("experiment=pretrain",)
+    return build(compose("train", [*choice, f"data.root={corpus}", *SMALL]))
+
+
 def test_rollouts_begin_at_true_states_of_any_frame_and_spare_the_bodies_held_out(corpus: Path) -> None:
-    module, data = build(compose("train", ["experiment=pretrain", f"data.root={corpus}", *SMALL]))
+    module, data = pretraining(corpus)
     data.setup("fit")
     keys = [key for epoch in range(30) for batch in _batches(data, epoch) for key in batch]
     assert {key.sequence for key in keys} == set(range(2 * SEQUENCES))
@@ -53,7 +61,9 @@ def test_rollouts_begin_at_true_states_of_any_frame_and_spare_the_bodies_held_ou
     state = module.method.initial([sample], module.model.batch((0,)))
     truth = data.objects[0].body.positions[1]
     assert torch.equal(state.positions, truth[8]) and torch.equal(state.previous, truth[7])
-    compared, _ = module.supervision.comparison([sample], module.model.batch((0,)))(_still(truth[9:13]), 0)
+    identity = torch.eye(3).expand(4, 100, 3, 3)
+    states = States(truth[9:13], identity, identity)
+    compared, _ = module.supervision.comparison([sample], module.model.batch((0,)))(states, 0)
     assert compared.max() < 1e-9
 
 
@@ -63,15 +73,8 @@ def _batches(data, epoch: int):
     return list(sampler)
 
 
-def _still(positions: torch.Tensor):
-    from gausim.training.rollout import States
-
-    identity = torch.eye(3).expand(len(positions), 100, 3, 3)
-    return States(positions, identity, identity)
-
-
 def test_the_known_material_gives_the_body_its_lowest_period(corpus: Path) -> None:
-    module, data = build(compose("train", ["experiment=pretrain", f"data.root={corpus}", *SMALL]))
+    module, data = pretraining(corpus)
     model = module.model
     assert isinstance(model.template, MaterialTemplate)
     for scene_id, item in enumerate(data.objects):
@@ -100,7 +103,7 @@ def base(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path, base: Path, tmp_path: Path) -> None:
-    _, data = build(compose("train", ["experiment=pretrain", f"data.root={corpus}", *SMALL]))
+    _, data = pretraining(corpus)
     body = data.objects[0].scene()
     periods = {}
     for stiffness in (1.0, 4.0):
@@ -184,8 +187,7 @@ def test_a_fit_to_the_truth_has_no_error_and_keeps_the_order_of_stiffness() -> N
 
 def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus: Path) -> None:
     torch.manual_seed(0)
-    root = [f"data.root={corpus}", *SMALL]
-    module, data = build(compose("train", ["experiment=pretrain_fit", "init_from=RUN", "data.seen=8", *root]))
+    module, data = pretraining(corpus, "experiment=pretrain_fit", "init_from=RUN", "data.seen=8")
     model, body = module.model, data.objects[0].body
     candidates = [float(STIFFNESS[8]), float(DRAG[5]) - model.template.start[1]]
     with torch.no_grad():  # a material that is nearest to these candidates, of both numbers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 import torch
 from lightning.pytorch import LightningModule, Trainer
 
+from gausim.runs.cost import TrainingCost
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.callbacks.resume import RunCheckpoint
 from gausim.training.callbacks.time_budget import TimeBudget
@@ -115,3 +117,23 @@ def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: py
     resumed.on_train_start(trainer, module)
     assert module.time_fraction == 0.5  # what the next step's learning rate follows
     assert [step(resumed, trainer) for _ in range(2)] == [0.75, 1.0] and trainer.should_stop
+
+
+def test_cost_goes_on_where_a_checkpoint_ended() -> None:
+    cost = TrainingCost()
+    assert cost.notes() == [] and set(cost.summary().values()) == {0.0}
+    time.sleep(0.05)
+    first = cost.state_dict()
+    assert 0.05 <= first["seconds"] < 5 and first["peak_bytes"] > 1e7 and first["cpu_seconds"] < first["seconds"]
+    later = TrainingCost()
+    later.load_state_dict({**first, "seconds": 120.0, "cpu_seconds": 90.0})
+    later.begin()
+    wall, processor = time.perf_counter(), time.process_time()
+    while min(time.perf_counter() - wall, time.process_time() - processor) < 0.06:
+        torch.rand(1000).sort()
+    second = later.state_dict()
+    assert second["seconds"] >= 120.05 and 90.05 <= second["cpu_seconds"] < 95
+    assert second["peak_bytes"] >= first["peak_bytes"] and second == later.summary()
+    assert later.notes() == [
+        f"Trained in 2.0 minutes, 1.5 of processor time; it held {second['peak_bytes'] / 1e9:.1f} GB at most."
+    ]

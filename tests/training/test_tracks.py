@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from helpers import sway, toy_object
 from helpers.simulators import gausim
 from torch import Tensor
 
-from gausim.core import ConfigError, HandPath
+from gausim.core import ConfigError, GaussianScene, HandPath, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.losses import ImageLoss
 from gausim.models.initial_state import ModalInitialStates
@@ -25,19 +26,22 @@ from gausim.render.draw import draw
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.images import Sources
-from gausim.training.supervision.motion_tracker import MotionTracker
-from gausim.training.supervision.motion_tracks import TrackSupervision
+from gausim.training.supervision.motion_tracks import MotionTracker, TrackSupervision
 from gausim.training.supervision.points import PointSupervision
 
 SCENE = toy_object.toy_scene()
 FRAMES, MODES = 5, 6
+ELASTIC = partial(ElasticTemplate, modes=MODES, neighbours=6)
+
+
+def small(scene: GaussianScene, **options: Any) -> GausSim:
+    torch.manual_seed(0)
+    return gausim([scene], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, **options)
 
 
 @pytest.fixture(scope="module")
 def model() -> GausSim:
-    template = partial(ElasticTemplate, modes=MODES, neighbours=6)
-    torch.manual_seed(0)
-    return gausim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
+    return small(SCENE, template=ELASTIC)
 
 
 @pytest.fixture
@@ -56,13 +60,12 @@ def coordinates() -> Tensor:
 def filmed(model: GausSim, coordinates: Tensor) -> SequenceSample:
     motions = model.smooth_motions(0)
     assert motions is not None
-    deformation_gradients = motions.deformations(coordinates)
-    state = (
-        SCENE.means + motions.displacements(coordinates),
-        deformation_gradients,
-        polar_rotation(deformation_gradients),
-    )
-    return _film(state, motions.unit_of_kernel)
+    return _film(_state(motions, coordinates)[:3], motions.unit_of_kernel)
+
+
+def _state(motions: SmoothMotions, coordinates: Tensor) -> Placed:
+    deformations = motions.deformations(coordinates)
+    return Placed(SCENE.means + motions.displacements(coordinates), deformations, polar_rotation(deformations))
 
 
 def _film(state: Sequence[Tensor], unit_of_kernel: Tensor) -> SequenceSample:
@@ -87,9 +90,7 @@ def test_motion_of_several_modes_is_found_in_the_images(
 
 def test_motion_about_moving_hands_is_found_in_the_images(sources: Sources, coordinates: Tensor) -> None:
     scene = replace(SCENE, hand=torch.where(SCENE.pinned, 0, -1))
-    torch.manual_seed(0)
-    template = partial(ElasticTemplate, modes=MODES, neighbours=6)
-    model = gausim([scene], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
+    model = small(scene, template=ELASTIC)
     corners = torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.1, 0.0], [0.0, -0.1, 0.0]])
     way = torch.linspace(0, 0.4, FRAMES)[:, None, None] * torch.tensor([1.0, 0.5, 0.0])
     path = HandPath.of(corners + way, torch.zeros(3, dtype=torch.long))
@@ -97,8 +98,7 @@ def test_motion_about_moving_hands_is_found_in_the_images(sources: Sources, coor
     references = method.references(0, FRAMES - 1)
     motions = model.smooth_motions(0)
     assert motions is not None and references is not None
-    deformation = motions.deformations(0.5 * coordinates)
-    made = Placed(SCENE.means + motions.displacements(0.5 * coordinates), deformation, polar_rotation(deformation))
+    made = _state(motions, 0.5 * coordinates)
     rows = [Placed(*(x[f] for x in made[:3])) for f in range(FRAMES)]
     placed = [rows[0], *(carried.place(row) for (carried, _), row in zip(references, rows[1:], strict=True))]
     state = [torch.stack(x) for x in zip(*(row[:3] for row in placed), strict=True)]
@@ -166,7 +166,5 @@ def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
 
 
 def test_a_model_without_smooth_motions_is_refused(sources: Sources) -> None:
-    paper = gausim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1)
-    without = replace(sources, motions=paper.smooth_motions)
     with pytest.raises(ConfigError, match="this model has none. Use supervision=images"):
-        TrackSupervision(without)
+        TrackSupervision(replace(sources, motions=small(SCENE).smooth_motions))

@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import sway
-from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 from torch import Tensor, nn
 
 from gausim.core import ConfigError, DivergenceError, SimState
@@ -25,12 +26,18 @@ SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
 sample, sway_module, real_module, ELASTIC = sway.sample, sway.sway_module, sway.real_module, sway.ELASTIC
 
 
-def fit(module: GausSimModule, batches: list[list[SequenceSample]], tmp_path: Path, epochs: int = 1) -> Trainer:
+def fit(
+    module: GausSimModule,
+    batches: list[list[SequenceSample]],
+    tmp_path: Path,
+    epochs: int = 1,
+    after: Callable[[], None] = lambda: None,
+) -> None:
+    """Trains; ``after`` is called after every step."""
     settings = TrainerSettings(max_epochs=epochs, accelerator="cpu", progress=False, log_every_n_steps=1)
-    trainer = make_trainer(settings, run_dir=tmp_path)
+    seen = LambdaCallback(on_train_batch_end=lambda *_: after())
     loader = torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda x: x)  # type: ignore[arg-type]
-    trainer.fit(module, loader)
-    return trainer
+    make_trainer(settings, run_dir=tmp_path, callbacks=[seen]).fit(module, loader)
 
 
 def snapshot(module: GausSimModule) -> dict[str, Tensor]:
@@ -57,7 +64,7 @@ def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: 
     module = sway_module(objective)
     samples = [sample(0), sample(2)]
     batch = module.model.batch([0, 1])
-    state, total = module.initial(samples, batch), torch.zeros(())
+    state, total = module.method.initial(samples, batch), torch.zeros(())
     for t in range(3):
         if t and backprop_steps and t % backprop_steps == 0:
             state = state.detach()
@@ -76,22 +83,17 @@ def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: 
             torch.testing.assert_close(ours[name], parameter.grad, rtol=1e-3, atol=1e-3 * float(ours[name].abs().max()))
 
 
-@pytest.mark.parametrize("deferred", [False, True])
-def test_positions_that_break_are_named_and_nothing_moves(deferred: bool, tmp_path: Path) -> None:
-    module = sway_module()
-    module.defers = lambda device: deferred  # type: ignore[method-assign]
-    module.model.poison = math.inf
+@pytest.mark.parametrize("broken", ["positions", "deferred positions", "gradient"])
+def test_what_breaks_is_named_and_nothing_moves(broken: str, tmp_path: Path) -> None:
+    module, said = sway_module(), r"predicted step 1 of 3, sequence toy/seq_0: positions"
+    if broken == "gradient":
+        module.model.keep.register_hook(lambda grad: grad * math.nan)
+        said = r"gradient of group 'network'"
+    else:
+        module.defers = lambda device: broken.startswith("deferred")  # type: ignore[method-assign]
+        module.model.poison = math.inf
     before = snapshot(module)
-    with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
-        fit(module, [[sample(0)]], tmp_path)
-    assert all(torch.equal(before[n], p) for n, p in module.named_parameters())
-
-
-def test_a_gradient_that_breaks_is_named_and_nothing_moves(tmp_path: Path) -> None:
-    module = sway_module()
-    module.model.keep.register_hook(lambda grad: grad * math.nan)
-    before = snapshot(module)
-    with pytest.raises(DivergenceError, match=r"gradient of group 'network'"):
+    with pytest.raises(DivergenceError, match=said):
         fit(module, [[sample(0)]], tmp_path)
     assert all(torch.equal(before[n], p) for n, p in module.named_parameters())
 
@@ -155,14 +157,8 @@ def test_clipping_by_group_and_altogether() -> None:
 def test_absent_sequences_and_scenes_do_not_move(tmp_path: Path) -> None:
     module = real_module(SCENE_OF_SEQUENCE, states=ModalInitialStates, template=ELASTIC)
     seen: list[dict[str, Tensor]] = []
-    recorded = module.training_step
-
-    def record(samples: list[SequenceSample], batch_idx: int) -> None:
-        recorded(samples, batch_idx)
-        seen.append(snapshot(module))
-
-    module.training_step = record  # type: ignore[method-assign]
-    fit(module, [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 3, tmp_path)
+    batches = [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 3
+    fit(module, batches, tmp_path, after=lambda: seen.append(snapshot(module)))
     own = re.compile(r"initial_states\.velocity\.[12]|.*(log_density|attributes)\.1|model\.template\.scenes\.1\..*")
     absent = [name for name in seen[0] if own.fullmatch(name)]
     assert len(absent) > 4
@@ -204,14 +200,8 @@ def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -
     parts = {"objective": Objective(backprop_steps=0, static_weight=0.0), "optimizer": settings}
     module = real_module(hidden=16, layers=2, output_scale=0.05, rest_inputs=True, parts=parts)
     losses: list[float] = []
-    recorded = module.training_step
-
-    def record(samples: list[SequenceSample], batch_idx: int) -> None:
-        recorded(samples, batch_idx)
-        losses.append(module.last_stats["loss_image"])
-
-    module.training_step = record  # type: ignore[method-assign]
-    fit(module, [[sample(0, steps=5)]] * 300, tmp_path)
+    batches = [[sample(0, steps=5)]] * 300
+    fit(module, batches, tmp_path, after=lambda: losses.append(module.last_stats["loss_image"]))
     assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
 
 

@@ -15,7 +15,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gausim.benchmark.train import peak_saved_bytes
 from gausim.losses import Objective
-from gausim.training import step
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.supervision import comparison
@@ -158,7 +157,7 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     torch.cuda.set_sync_debug_mode("error")
     try:
         optimizer.zero_grad(set_to_none=True)
-        statistics = step.roll_out(module, samples, facts, draws)
+        statistics = module.roll_out(samples, facts, draws)
         norms = module.settings.clip(optimizer)
     finally:
         torch.cuda.set_sync_debug_mode("default")

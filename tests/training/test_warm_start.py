@@ -116,10 +116,8 @@ def test_the_fit_has_the_settings_of_the_model_and_what_it_leaves_is_said(
     assert seen == [60] and "without a network 0.200 of the motion is left" in capsys.readouterr().out
 
 
-def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="warm_start: expected updates, decay and later >= 0"):
-        WarmStart(updates=-1)
-    with pytest.raises(ConfigError, match="decay=-0.1"):
-        WarmStart(decay=-0.1)
-    with pytest.raises(ConfigError, match=r"growing in \(0, 1\].*growing=0.0"):
-        WarmStart(growing=0.0)
+@pytest.mark.parametrize(("name", "wrong"), [("updates", -1), ("decay", -0.1), ("growing", 0.0)])
+def test_wrong_settings_are_refused(name: str, wrong: float) -> None:
+    said = rf"warm_start: expected updates, decay and later >= 0, growing in \(0, 1\].*{name}={wrong}"
+    with pytest.raises(ConfigError, match=said):
+        WarmStart(**{name: wrong})  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ from torch import Tensor
 from gausim import __version__
 from gausim.kernels.operations import plain_forms
 from gausim.runs import provenance
-from gausim.runs.memory import process_memory
+from gausim.runs.cost import process_memory
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from gausim.results.looks import DEVELOPMENT, TEST_PART
 from gausim.runs.defaults import with_defaults
 from gausim.runs.directory import RunDirectory
 from gausim.training.callbacks.convergence import Convergence
-from gausim.training.callbacks.judge import EpochJudge
+from gausim.training.callbacks.time_budget import EpochJudge
 from gausim.training.callbacks.warm_start import WarmStart
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.fitted.fitting import StagedFit

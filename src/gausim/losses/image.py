@@ -37,12 +37,7 @@ class ImageLoss(nn.Module):
     compares_alpha: bool = False
 
     def __init__(self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS) -> None:
-        """Stores the settings.
-
-        Args:
-            balance: lambda, the weight of the squared error in [0, 1].
-            window: odd size of the SSIM window [pixels].
-            pixels: factor on the mean over pixels.
+        """``balance`` is lambda in [0, 1], ``window`` the odd size of the SSIM window [pixels].
 
         Raises:
             ConfigError: a setting out of range.

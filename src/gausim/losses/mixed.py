@@ -22,14 +22,7 @@ class MixedLoss(ImageLoss):
     def __init__(
         self, *, l1: float = 0.0, mse: float = 0.0, dssim: float = 0.0, alpha: float = 0.0, window: int = SSIM_WINDOW
     ) -> None:
-        """Stores the weights.
-
-        Args:
-            l1: weight of the absolute error.
-            mse: weight of the squared error.
-            dssim: weight of 1 - SSIM.
-            alpha: weight of the squared error of the opacity.
-            window: odd size of the SSIM window [pixels].
+        """Stores the weights of the terms, and the odd size of the SSIM window [pixels].
 
         Raises:
             ConfigError: a weight is negative, or all are zero.
@@ -50,23 +43,17 @@ class MixedLoss(ImageLoss):
             self.check_size(prediction)
         leaf = prediction.detach().clone().requires_grad_()
         with torch.enable_grad():
-            values = self._of_states(leaf, target)
-            (gradient,) = torch.autograd.grad(values.sum(), leaf)
-        return values.detach(), gradient
-
-    def _of_states(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Means over views, pixels and channels of each state."""
-        color, true = prediction[..., :3], target[..., :3]
-        difference = color - true
-        total = prediction.new_zeros(len(prediction))
-        if self.l1 > 0:
-            total = total + self.l1 * difference.abs().mean((1, 2, 3, 4))
-        if self.mse > 0:
-            total = total + self.mse * difference.square().mean((1, 2, 3, 4))
-        if self.dssim > 0:
-            first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (color, true))
-            similarity = structural_similarity(first, second, gaussian_taps(self.window)).reshape(len(total), -1)
-            total = total + self.dssim * (1 - similarity.mean(1))
-        if self.alpha > 0:
-            total = total + self.alpha * (prediction[..., 3] - target[..., 3]).square().mean((1, 2, 3))
-        return total
+            color, true = leaf[..., :3], target[..., :3]
+            difference, total = color - true, leaf.new_zeros(len(leaf))
+            if self.l1 > 0:
+                total = total + self.l1 * difference.abs().mean((1, 2, 3, 4))
+            if self.mse > 0:
+                total = total + self.mse * difference.square().mean((1, 2, 3, 4))
+            if self.dssim > 0:
+                first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (color, true))
+                similarity = structural_similarity(first, second, gaussian_taps(self.window)).reshape(len(total), -1)
+                total = total + self.dssim * (1 - similarity.mean(1))
+            if self.alpha > 0:
+                total = total + self.alpha * (leaf[..., 3] - target[..., 3]).square().mean((1, 2, 3))
+            (gradient,) = torch.autograd.grad(total.sum(), leaf)
+        return total.detach(), gradient

@@ -1,8 +1,11 @@
-"""Objective of training: weights of the loss terms and lengths of backpropagation."""
+"""Objective of training: weights of the loss terms, lengths of backpropagation, and the static loss."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+
+from jaxtyping import Float
+from torch import Tensor
 
 from gausim.core import ConfigError
 from gausim.losses.image import ImageLoss
@@ -94,3 +97,13 @@ class Objective:
     def window(self, steps: int) -> int:
         """Length of the stretches through which loss gradients flow, in a rollout of ``steps``."""
         return min(steps, self.backprop_steps) if self.backprop_steps else steps
+
+
+def static_loss(
+    positions: Float[Tensor, "K 3"], rest: Float[Tensor, "K 3"], diagonal: Float[Tensor, "K 1"]
+) -> Float[Tensor, ""]:
+    """Static loss (METHOD section 4): sum over kernels of the squared distance of one step from the rest state.
+
+    Lengths are divided by the diagonal of each kernel's scene, so the loss is independent of the scene's unit.
+    """
+    return ((positions - rest) / diagonal).square().sum()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.plugins.io import CheckpointIO
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from gausim.core import GaussianScene, RunError
@@ -25,7 +25,7 @@ DIGEST = "digest"
 RESUME_FORMAT = 2
 
 
-class AtomicCheckpointIO(CheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes to a temporary file, flushes it to the disk, verifies it, and only then renames it.
 
     If a step fails, the previous file of that name stays and an error is raised. The predecessor of ``last.ckpt`` is
@@ -56,10 +56,6 @@ class AtomicCheckpointIO(CheckpointIO):
     ) -> dict[str, Any]:
         """Reads a checkpoint to the CPU without executing code from it."""
         return read_checkpoint(Path(path))
-
-    def remove_checkpoint(self, path: str | Path) -> None:
-        """Deletes a checkpoint."""
-        Path(path).unlink(missing_ok=True)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

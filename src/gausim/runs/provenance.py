@@ -26,13 +26,13 @@ def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
         ``gausim``, ``torch``, ``python``: versions; ``machine``: processor and GPU; ``commit``; ``modified``: whether
         tracked files of the package differ from the commit.
     """
-    facts = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
-    facts["machine"] = machine()
+    versions = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
     # A package installed inside another project's checkout is not tracked by that repository.
     tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py") is not None
     commit = _git(package, "rev-parse", "HEAD") if tracked else None
     status = _git(package, "status", "--porcelain", "--untracked-files=no", "--", ".") if commit else None
-    return {**facts, "commit": commit, "modified": None if status is None else bool(status)}
+    modified = None if status is None else bool(status)
+    return {**versions, "machine": machine(), "commit": commit, "modified": modified}
 
 
 def machine() -> str:
@@ -52,12 +52,8 @@ def data_provenance(data: ObjectData) -> dict[str, Any]:
     manifest = next((path for path in manifests if path.is_file()), manifests[-1])
     masks = data.masks_path or data.scene_path.with_suffix(".masks.npz")
     files = {"scene": data.scene_path, "masks": masks, "manifest": manifest}
-    return {"root": str(data.root), **{key: {"file": p.name, "sha256": file_hash(p)} for key, p in files.items()}}
-
-
-def file_hash(path: Path) -> str | None:
-    """SHA-256 of a file in hexadecimal; None where there is no such file."""
-    return sha256(path) if path.is_file() else None
+    hashes = {key: {"file": p.name, "sha256": sha256(p) if p.is_file() else None} for key, p in files.items()}
+    return {"root": str(data.root), **hashes}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -59,65 +59,63 @@ UNSUPPORTED: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("SpringMass", "ConstantVelocity"), {"gradients": True}),
 }
 IMAGES = "gausim.training.supervision.images.training_views"
-SIMULATOR = "gausim.models.step.simulator.GausSim"
-# New groups of the arguments of the simulator: class, and new name by old name.
-PARTS: dict[str, tuple[str, dict[str, str]]] = {
-    "hierarchy": (
-        "gausim.models.settings.HierarchySettings",
-        {
-            "clustering": "clustering", "max_neighbours": "max_neighbours", "edges": "edges",
-            "share_levels": "share_network", "body_frame": "body_frame",
-        },
-    ),
-    "features": (
-        "gausim.models.step.features.FeatureOptions",
-        {
-            "angle": "angle", "rest_inputs": "rest_inputs", "coarse_inputs": "coarse_inputs",
-            "velocity_inputs": "velocities", "attributes": "attributes", "gravity": "gravity",
-            "normaliser_floor": "normaliser_floor",
-        },
-    ),
-    "network": (
-        "gausim.nn.meshgraphnet.MeshGraphNet",
-        {k: k for k in ("hidden", "layers", "norm", "activation", "precision", "checkpoint", "compile")},
-    ),
-    "head": (
-        "gausim.models.step.head.Head",
-        {"output_scale": "output_scale", "zero_output": "zero_output", "lever_head": "lever", "anchor": "anchor"},
-    ),
-    "rollout": (
-        "gausim.models.settings.RolloutSettings",
-        {"cuda_graph": "cuda_graph", "passive_frames": "energy_guard_frames"},
-    ),
-}  # fmt: skip
 # Removed settings of the elastic template with the supported value of each.
 ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
-# Settings that are now in groups; the plasticity of the material point method was removed.
-_MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
-_GRID = (
-    "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
-)  # fmt: skip
-GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+SIMULATOR = "gausim.models.step.simulator.GausSim"
+Group = tuple[str, dict[str, str]]
+
+
+def _group(target: str, *kept: str, **renamed: str) -> Group:
+    """The class of a group, and its settings by their old names."""
+    return target, {**{name: name for name in kept}, **renamed}
+
+
+_MATERIAL = _group("gausim.baselines.mpm.Material", "young_modulus", "poisson_ratio", "density")
+_GRID = _group(
+    "gausim.baselines.material_point.method.Discretisation", "cells", "damping", "substeps", "courant", "filling"
+)
+# Settings that are now in groups, by class.
+GROUPS: dict[str, dict[str, Group]] = {
     "gausim.baselines.material_point.physdreamer.PhysDreamer": {
         "material": _MATERIAL,
         "discretisation": _GRID,
-        "modulus": (
+        "modulus": _group(
             "gausim.baselines.material_point.physdreamer.ModulusField",
-            ("modulus_scale", "modulus_resolution"),
+            modulus_scale="scale", modulus_resolution="resolution",
         ),
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
     "gausim.models.template.material.MaterialTemplate": {
-        "solid": ("gausim.models.template.solid.SolidSettings", ("spacing",)),
+        "solid": _group("gausim.models.template.solid.SolidSettings", "spacing"),
     },
     "gausim.losses.objective.Objective": {
-        "energy": (
-            "gausim.losses.objective.EnergyLoss",
-            ("energy_weight", "energy_frames", "energy_stretch", "energy_probability"),
+        "energy": _group(
+            "gausim.losses.objective.EnergyLoss", energy_weight="weight", energy_frames="frames",
+            energy_stretch="stretch", energy_probability="probability",
         ),
     },
-}
+    SIMULATOR: {
+        "hierarchy": _group(
+            "gausim.models.settings.HierarchySettings", "clustering", "max_neighbours", "edges", "body_frame",
+            share_levels="share_network",
+        ),
+        "features": _group(
+            "gausim.models.step.features.FeatureOptions", "angle", "rest_inputs", "coarse_inputs", "attributes",
+            "gravity", "normaliser_floor", velocity_inputs="velocities",
+        ),
+        "network": _group(
+            "gausim.nn.meshgraphnet.MeshGraphNet", "hidden", "layers", "norm", "activation", "precision", "checkpoint",
+            "compile",
+        ),
+        "head": _group(
+            "gausim.models.step.head.Head", "output_scale", "zero_output", "anchor", lever_head="lever"
+        ),
+        "rollout": _group(
+            "gausim.models.settings.RolloutSettings", "cuda_graph", passive_frames="energy_guard_frames"
+        ),
+    },
+}  # fmt: skip
 # Old prefixes of the weights of the predictor within the model.
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
@@ -149,10 +147,8 @@ def with_present_names(config: Any) -> Any:
             found["supervision"] = {"_target_": IMAGES, "_partial_": True}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
-        groups = GROUPS.get(str(found.get("_target_")))
-        if groups is not None and not any(isinstance(found.get(group), dict) for group in groups):
-            return _grouped(found)
-        return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
+        groups = GROUPS.get(str(found.get("_target_")), {})
+        return _grouped(found) if groups and not any(isinstance(found.get(k), dict) for k in groups) else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
 
 
@@ -172,31 +168,22 @@ def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings in their groups."""
-    groups = GROUPS[old["_target_"]]
+    """Settings in their groups; missing ones get their former defaults. Plasticity was removed."""
+    target = old["_target_"]
     if old.get("material", "fixed_corotated") != "fixed_corotated":
         raise ValueError(f"method.material is {old['material']!r}, which is no longer supported: fit the run again")
-    gone = {"material", "yield_stress", *(name for _, names in groups.values() for name in names)}
+    gone = {"material", "yield_stress", "edge_bucket", "radii", "predicted_levels", "graph_radii"}
+    gone |= {name for _, names in GROUPS[target].values() for name in names}
     new = {name: value for name, value in old.items() if name not in gone}
-    for group, (target, names) in groups.items():
-        own = {name.removeprefix(f"{group}_"): old[name] for name in names if name in old}
-        new[group] = {"_target_": target, **own}
-    return new
-
-
-def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
-    """The simulator's arguments in their groups; missing arguments get their former defaults."""
-    moved = {name for _, names in PARTS.values() for name in names}
-    gone = {"edge_bucket", "radii", "predicted_levels", "graph_radii", *moved}
-    new = {name: value for name, value in old.items() if name not in gone}
-    for part, (target, names) in PARTS.items():
-        new[part] = {"_target_": target, **{names[k]: old[k] for k in names if k in old}}
-    new["network"]["_partial_"] = True
-    diameters, lengths = (0.0, *old.get("radii", (0.1, 0.35))), old.get("graph_radii", (2.0, 0.4))
-    predicted = old.get("predicted_levels", (2, 1))
-    new["hierarchy"]["levels"] = [
-        {"diameter": diameters[level], "edge_length": length} for level, length in zip(predicted, lengths, strict=True)
-    ]
+    for group, (kind, names) in GROUPS[target].items():
+        new[group] = {"_target_": kind, **{names[k]: old[k] for k in names if k in old}}
+    if target == SIMULATOR:
+        new["network"]["_partial_"] = True
+        diameters, lengths = (0.0, *old.get("radii", (0.1, 0.35))), old.get("graph_radii", (2.0, 0.4))
+        predicted = zip(old.get("predicted_levels", (2, 1)), lengths, strict=True)
+        new["hierarchy"]["levels"] = [
+            {"diameter": diameters[level], "edge_length": length} for level, length in predicted
+        ]
     return new
 
 

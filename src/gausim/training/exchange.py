@@ -20,11 +20,14 @@ class Exchange:
         self._ranks, self._normalisers = ranks, normalisers_of(model)
         self._begun = False
 
+    @torch.no_grad()
     def begin(self, see_first_frame: Callable[[], None]) -> None:
         """Initialises normalisers without statistics from the first frame of the ranks' first batches."""
         if not self._begun and not all(float(normaliser.count) for normaliser in self._normalisers):
             see_first_frame()
-            self.statistics()
+            gathered = self._gathered()
+            _assign(gathered, self._ranks.add(gathered, gathered))
+            self.absorb()
         self._begun = True
 
     @torch.no_grad()
@@ -46,13 +49,6 @@ class Exchange:
         if statistics.pulls is not None:
             by_images, by_momentum = (pull.norm() for pull in statistics.pulls)
             statistics.gradient_fraction = by_momentum / (by_images + by_momentum).clamp_min(1e-30)
-
-    @torch.no_grad()
-    def statistics(self) -> None:
-        """Adds the ranks' normaliser sums and updates the statistics."""
-        gathered = self._gathered()
-        _assign(gathered, self._ranks.add(gathered, gathered))
-        self.absorb()
 
     def absorb(self) -> None:
         """Updates the statistics with normaliser sums that are added already."""

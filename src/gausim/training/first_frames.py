@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gausim.core import Cameras
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.dataset import SampleKey, SequenceSample
-from gausim.render.draw import SceneAppearance, draw
+from gausim.data.dataset import SampleKey
 from gausim.training.module import GausSimModule
 
 # Frames before which a body is taken to fall freely.
@@ -36,8 +35,9 @@ def begin_free_bodies(module: GausSimModule, datamodule: ReadyDataModule) -> Non
         rest = scenes[scene_id].means.double()
         moved = place - rest[scenes[scene_id].simulated].mean(0)
         # The middle of what is seen is not the centre of the kernels: compare with the body drawn at that place.
-        drawn = centroids(_alpha(module, sample, rest + moved)[None], sample.cameras)[0]
-        states.begin(sequence_id, moved + place - drawn, velocity)
+        drawn = module.images.undeformed(sample, (rest + moved).to(scenes[scene_id].means))
+        seen = centroids(drawn.alpha.double(), sample.cameras)[0]
+        states.begin(sequence_id, moved + place - seen, velocity)
         module.images.begun[sequence_id] = states.state(sequence_id).positions.detach()
 
 
@@ -62,13 +62,3 @@ def ballistic(places: Float[Tensor, "F 3"], gravity: Float[Tensor, " 3"]) -> tup
     columns = torch.stack((torch.ones_like(frame), frame), 1)
     found = torch.linalg.lstsq(columns, straight).solution
     return found[0], found[1]
-
-
-@torch.no_grad()
-def _alpha(module: GausSimModule, sample: SequenceSample, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "V H W"]:
-    scene = module.simulator.scenes[sample.scene_id]
-    identity = torch.eye(3)[None, None]
-    units = torch.zeros(scene.count, dtype=torch.long)
-    appearance = SceneAppearance.of(scene, scene.foreground)
-    places = positions.to(scene.means)[None]
-    return draw(module.renderer, appearance, places, identity, identity, units, sample.cameras).alpha[0].double()

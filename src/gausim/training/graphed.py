@@ -31,7 +31,7 @@ class _Stretch(nn.Module):
         """Positions, deformation gradients, rotations and momentum losses of the T frames."""
         model, state = cast(Any, self.model), SimState(positions, previous)
         ((_, made),) = windows(model, self._batch, state, self._steps, self._steps, isolated=self._isolated)
-        return (*States.of(made).tensors(), torch.stack([step.momentum for step in made]))
+        return (*States.of(made), torch.stack([step.momentum for step in made]))
 
 
 class GraphedRollouts:

@@ -1,4 +1,4 @@
-"""Parts of training that an optimiser step needs, without Lightning."""
+"""Parts of training that an optimiser step needs, without a trainer."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gausim.models.reference.reference import hand_motion
 from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
 from gausim.runs.checkpoint import WeightAverage
-from gausim.training.baseline_metrics import Baselines, SequenceBaseline
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.graphed import GraphedRollouts
-from gausim.training.method import Method, Task
+from gausim.training.method import Method
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
 from gausim.training.rollout import States, windows
+from gausim.training.statistics import Baselines, SequenceBaseline
 from gausim.training.supervision.images import ImageSupervision, Supervision
 from gausim.training.terms.free_motion import FreeMotion
 
@@ -50,8 +50,8 @@ class Learner(nn.Module):
     ) -> None:
         super().__init__()
         self.method, self.model, self.initial_states = method, method.model, method.initial_states
-        self.objective = objective if objective is not None else Objective()
-        self.settings = optimizer if optimizer is not None else OptimizerSettings()
+        self.objective = objective or Objective()
+        self.settings = optimizer or OptimizerSettings()
         self.graphs = GraphedRollouts(method.model)
         self.free_motion = FreeMotion(method.model, self.objective, self.graphs)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
@@ -89,14 +89,6 @@ class Learner(nn.Module):
             raise ConfigError(f"optimizer: parameters in no group: {missing}. Add them to parameter_groups().")
         return self.method.build(self.settings)
 
-    def take_up(self, task: Task) -> None:
-        """Adopts the objective and settings of a task."""
-        if task.is_new:
-            self.baselines = Baselines(self.supervision)
-        if task.objective is not None:
-            self.objective, self.images.loss = task.objective, task.objective.image
-        self.settings = task.settings or self.settings
-
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss, if there are trainable parameters."""
         if loss.requires_grad:
@@ -119,16 +111,12 @@ class Learner(nn.Module):
         if not self.simulator.scenes[sample.scene_id].surroundings.free:
             return None
         batch = self.simulator.batch([sample.scene_id])
-        return self.initial([sample], batch).positions
+        return self.method.initial([sample], batch).positions
 
     def rest_loss(self, sample: SequenceSample) -> float:
         """Mean loss of the rest state on the frames of a sample: the unit of penalties."""
         losses = self.baseline(sample).static[: sample.steps]
         return sum(losses) / len(losses)
-
-    def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
-        """Initial state of the rollouts of a batch."""
-        return self.method.initial(samples, batch)
 
     def hands(self, samples: Sequence[SequenceSample]) -> list[Hands | None] | None:
         """Poses of the hands of each sample's sequence; None where no sample has any."""
@@ -160,8 +148,7 @@ class Learner(nn.Module):
         appearance, units = self.images.appearances.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
         frames = [self.images.rest_image(sample, batch.rest).rgb]
         with evaluating(self):
-            initial, hands = self.initial([sample], batch), self.hands([sample])
+            initial, hands = self.method.initial([sample], batch), self.hands([sample])
             for _, made in windows(self.simulator, batch, initial, sample.steps, 1, hands=hands):
-                states = States.of(made).tensors()
-                frames.append(draw(self.images.renderer, appearance, *states, units, sample.cameras).rgb)
+                frames.append(draw(self.renderer, appearance, *States.of(made), units, sample.cameras).rgb)
         return torch.cat(frames)

@@ -18,8 +18,8 @@ from gausim.models.reference.reference import Carried, UnitMotion, hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.training.contracts import Simulator
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.terms.mixing import MixingTerm
-from gausim.training.terms.rest import RestTerm
+from gausim.training.terms.mixing import mixing_term
+from gausim.training.terms.rest import rest_term
 from gausim.training.terms.term import Term
 
 
@@ -182,14 +182,19 @@ class SharedSimulator(Method):
 
     def terms(self) -> Sequence[Term]:
         """The static loss and the penalty on mode mixing."""
-        return RestTerm(self._simulator), MixingTerm(self.model)
+        return rest_term, mixing_term
 
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
         """x_0 and x_{-1} of the sequences of a batch."""
-        states = [self._states.state(s.sequence_id) for s in samples]
+        states = [self.state(s.sequence_id, s.start) for s in samples]
         return SimState(
             *(torch.cat(x).to(batch.rest) for x in zip(*((s.positions, s.previous) for s in states), strict=True))
         )
+
+    def state(self, sequence_id: int, start: int = 0) -> SimState:
+        """The state at which rollouts of a sequence begin; ``start`` is 0 where states of later frames are unknown."""
+        state: SimState = self._states.state(sequence_id)
+        return state
 
     def hands(self, sequence_id: int) -> Hands | None:
         """Poses of the hands of a sequence; None where it has none."""
@@ -209,4 +214,4 @@ class SharedSimulator(Method):
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a training sequence from its initial state, for all kernels of its scene."""
         dynamics = SceneDynamics(cast(Any, self.model), self.scene_of_sequence[sequence_id])
-        return dynamics.rollout(self._states.state(sequence_id), steps, hands=self.hands(sequence_id))
+        return dynamics.rollout(self.state(sequence_id), steps, hands=self.hands(sequence_id))

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
-from torch.optim import Optimizer
 
 from gausim.data.dataset import SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.runs.checkpoint import RESUME_FORMAT, check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
 from gausim.runs.renamed import with_present_weights
-from gausim.training import step
-from gausim.training.learner import Learner
 from gausim.training.method import Moment
+from gausim.training.statistics import Baselines
+from gausim.training.step import OptimiserStep
 from gausim.training.supervision.motion_tracks import TrackSupervision
 
 # Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
@@ -27,7 +26,7 @@ COLLAPSED = 0.05
 COLLAPSE_AFTER = 100
 
 
-class GausSimModule(Learner, LightningModule):
+class GausSimModule(OptimiserStep, LightningModule):
     """Trains a method: rollout, rendering, losses and one optimiser step per batch.
 
     The backward pass runs after every stretch of the rollout, so that memory does not grow with T. Each of several
@@ -75,21 +74,15 @@ class GausSimModule(Learner, LightningModule):
         batches, epochs = float(trainer.num_training_batches), trainer.max_epochs or 1
         now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction, self.progress_limit)
         task = self.method.begin_step(optimizer.optimizer, self.settings, now)
-        self.take_up(task)
+        if task.is_new:
+            self.baselines = Baselines(self.supervision)
+        if task.objective is not None:
+            self.objective, self.images.loss = task.objective, task.objective.image
+        self.settings = task.settings or self.settings
         self.measuring = bool(self.fraction_every) and self.global_step % self.fraction_every == 0
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
         self._record({**stats, "lr": task.rate}, self.shown)
-
-    def optimise(
-        self,
-        samples: list[SequenceSample],
-        optimizer: Optimizer,
-        draws: torch.Generator,
-        advance: Callable[[], object] | None = None,
-    ) -> dict[str, float]:
-        """One optimiser step with all losses (:func:`gausim.training.step.optimise`), with or without a trainer."""
-        return step.optimise(self, samples, optimizer, draws, advance or optimizer.step)
 
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss, through the trainer if there is one."""

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError, SimState, Trajectory
+from gausim.core import ConfigError, SimState
 from gausim.data.corpus import CorpusBody
-from gausim.data.dataset import SequenceSample
 from gausim.data.pretraining import CorpusDataModule
 from gausim.models.hierarchy.units import fixed_units
-from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import REFERENCE_FPS, MaterialTemplate
 from gausim.training.contracts import Simulator
@@ -36,15 +34,13 @@ class KnownStates(SharedSimulator):
     are not trained: errors of phase would make them too large, and the bodies' damping is known.
     """
 
+    model: GausSim
+
     def __init__(self, model: GausSim, data: CorpusDataModule, scene_of_sequence: Sequence[int]) -> None:
         """Gives the model the bodies' material if it is known."""
         self.model, self.initial_states = model, None  # type: ignore[assignment]
-        self.scene_of_sequence, self._simulator, self._index = (
-            tuple(scene_of_sequence),
-            cast(Simulator, model),
-            data.index,
-        )
-        self._gausim, self._hands = model, {}
+        self.scene_of_sequence = tuple(scene_of_sequence)
+        self._simulator, self._index, self._hands = cast(Simulator, model), data.index, {}
         if data.knows_material:
             for scene_id, item in enumerate(data.objects):
                 give_material(model, scene_id, item.body)
@@ -54,18 +50,10 @@ class KnownStates(SharedSimulator):
         """The model's parameter groups."""
         return self._simulator.parameter_groups()
 
-    def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
-        """The true states at the beginnings of the samples."""
-        states = [self._index.state(s.sequence_id, s.start) for s in samples]
-        now, before = (torch.cat([getattr(s, name) for s in states]) for name in ("positions", "previous"))
-        return SimState(now.to(batch.rest), before.to(batch.rest))
-
-    def predict(self, sequence_id: int, steps: int) -> Trajectory:
-        """Frames 0..``steps`` of a sequence from its true state at frame 0."""
-        scene_id, like = self.scene_of_sequence[sequence_id], self._gausim.log_density[0]
-        state = self._index.state(sequence_id, 0)
-        initial = SimState(state.positions.to(like), state.previous.to(like))
-        return SceneDynamics(self._gausim, scene_id).rollout(initial, steps)
+    def state(self, sequence_id: int, start: int = 0) -> SimState:
+        """The true state at frame ``start`` of a sequence."""
+        true, like = self._index.state(sequence_id, start), self.model.log_density[0]
+        return SimState(true.positions.to(like), true.previous.to(like))
 
 
 def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:

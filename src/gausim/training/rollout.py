@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
@@ -56,8 +56,7 @@ def checkpointed_step(
     return Frame(positions, deformation_gradients, rotations, momentum, SimState(positions, last))
 
 
-@dataclass(frozen=True, eq=False)
-class States:
+class States(NamedTuple):
     """T predicted frames of all members of a batch (see :class:`gausim.training.contracts.Step`)."""
 
     positions: Float[Tensor, "T K 3"]
@@ -67,11 +66,7 @@ class States:
     @staticmethod
     def of(steps: Sequence[PredictedStep]) -> States:
         """Stacks the steps of a stretch."""
-        return States(*(torch.stack([getattr(step, f.name) for step in steps]) for f in fields(States)))
-
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions, deformation gradients and rotations."""
-        return self.positions, self.deformation_gradients, self.rotations
+        return States(*(torch.stack([getattr(step, name) for step in steps]) for name in States._fields))
 
 
 def windows(
@@ -180,7 +175,6 @@ class Explosions:
         """
         self._batch, self._diagonals, self._samples = batch, diagonals, samples
         self._limit, self._ranks = limit, ranks
-        self._rest: Tensor | None = None if batch is None else batch.rest
         self._lasts = None if deferred is None else torch.ones((), dtype=torch.bool, device=deferred)
 
     def end(self, positions: Float[Tensor, "T K 3"] | None, start: int, found: list[Tensor]) -> bool:
@@ -208,11 +202,11 @@ class Explosions:
 
     def spared(self, states: States) -> States:
         """The states, or the rest state once the rollout has ended, which can always be rendered."""
-        if self._lasts is None or self._rest is None:
+        if self._lasts is None or self._batch is None:
             return states
         identity = torch.eye(3, dtype=states.deformation_gradients.dtype, device=states.deformation_gradients.device)
-        rests = (self._rest, identity, identity)
-        return States(*(torch.where(self._lasts, x, r) for x, r in zip(states.tensors(), rests, strict=True)))
+        rests = (self._batch.rest, identity, identity)
+        return States(*(torch.where(self._lasts, x, r) for x, r in zip(states, rests, strict=True)))
 
     def counted(self, values: Tensor) -> Tensor:
         """The values, or zeros once the rollout has ended."""
@@ -220,9 +214,9 @@ class Explosions:
 
     def restart(self, state: SimState) -> SimState:
         """The state, or the rest state once the rollout has ended."""
-        if self._lasts is None or self._rest is None:
+        if self._lasts is None or self._batch is None:
             return state
-        return SimState(*(torch.where(self._lasts, x, self._rest) for x in (state.positions, state.previous)))
+        return SimState(*(torch.where(self._lasts, x, self._batch.rest) for x in (state.positions, state.previous)))
 
 
 def describe(step: int | None, samples: Sequence[SampleFacts], sample: SampleFacts | None, what: str) -> str:

@@ -13,7 +13,7 @@ from lightning.pytorch.loggers import Logger
 
 from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
-from gausim.runs.memory import keep_freed_memory
+from gausim.runs.cost import keep_freed_memory
 from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.resume import ExactResume
 from gausim.training.callbacks.time_budget import TimeBudget

@@ -27,7 +27,7 @@ from gausim.core.errors import ConfigError
 from gausim.io.files import write_durably
 from gausim.runs.directory import RunDirectory, is_free
 from gausim.runs.files import sole_writer
-from gausim.training.callbacks.judge import EpochJudge
+from gausim.training.callbacks.time_budget import EpochJudge
 
 try:
     import optuna

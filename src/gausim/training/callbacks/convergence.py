@@ -20,11 +20,11 @@ from gausim.core import ConfigError, DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.nn.mode import evaluating
-from gausim.training.baseline_metrics import excess
 from gausim.training.callbacks.cadence import training_data
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import StableDecaySchedule
 from gausim.training.rollout import States, windows
+from gausim.training.statistics import excess
 
 # Shows of a sequence over which an improvement is measured.
 PER_SHOWS = 10
@@ -107,9 +107,7 @@ class Convergence(Callback):
         return self._ending_since == trainer.current_epoch + 1 and not self.converged
 
     def _active(self, module: LightningModule, data: ReadyDataModule) -> bool:
-        if not isinstance(module, GausSimModule):
-            return False
-        schedule = module.settings.schedule
+        schedule = cast(GausSimModule, module).settings.schedule
         falls_at_the_end = isinstance(schedule, StableDecaySchedule) and schedule.decay < 1
         return falls_at_the_end and data.curriculum.t_start <= data.curriculum.t_max - self._held_back
 
@@ -177,7 +175,7 @@ def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: in
             for sample in samples:
                 batch = module.simulator.batch([sample.scene_id])
                 _, made = next(
-                    windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
+                    windows(module.simulator, batch, module.method.initial([sample], batch), sample.steps, sample.steps)
                 )
                 losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
                 baseline = module.baseline(sample)

@@ -96,7 +96,8 @@ class MotionWatch(Callback):
             return
         scene = module.simulator.scenes[scene_id]
         attached = attach_points(scene, points)
-        shown = [(number, record) for number, record in enumerate(item.sequences) if _is_shown(record)]
+        # Unseen frames of the test part, whose sequences have a limit, may not be looked at.
+        shown = [pair for pair in enumerate(item.sequences) if getattr(pair[1], "limit", None) is None]
         for number, record in shown[: self._sequences]:
             truth = item.ground_truth(record)
             if truth is None:
@@ -107,11 +108,6 @@ class MotionWatch(Callback):
                 module.print(f"motion of {item.name}/{record.name} is not told: {error}")
                 continue
             yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions), attached
-
-
-def _is_shown(record: object) -> bool:
-    """Whether unseen frames of a sequence may be looked at: not those of the test part."""
-    return getattr(record, "limit", None) is None
 
 
 def figures(

@@ -1,9 +1,10 @@
-"""The time budget of a run."""
+"""Early ends of a run: its time budget, and an outside decision, as a search makes for poor trials."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -49,8 +50,7 @@ class TimeBudget(Callback):
             trainer.should_stop = True
 
     def _drive(self, pl_module: LightningModule) -> None:
-        if isinstance(pl_module, GausSimModule):
-            pl_module.time_fraction = min(1.0, self._used / self._budget)
+        cast(GausSimModule, pl_module).time_fraction = min(1.0, self._used / self._budget)
 
     def state_dict(self) -> dict[str, float]:
         """The time used."""
@@ -59,3 +59,28 @@ class TimeBudget(Callback):
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Restores the time used."""
         self._used = float(state_dict["used"])
+
+
+class EpochJudge(Callback):
+    """Calls ``judge`` after each epoch; if it returns True, training ends and the run is finished (``stopped``).
+
+    Its arguments are the number of epochs done and the mean of the metric (a column of ``epochs.csv``) over the last.
+    """
+
+    def __init__(self, *, judge: Callable[[int, float], bool], metric: str) -> None:
+        self._judge, self._metric, self.stopped = judge, metric, False
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Calls the judge; the checkpoint saved afterwards contains the decision."""
+        assert isinstance(pl_module, GausSimModule)
+        value = pl_module.epoch_means().get(self._metric)
+        if value is not None and self._judge(trainer.current_epoch + 1, value):
+            self.stopped = trainer.should_stop = True
+
+    def state_dict(self) -> dict[str, bool]:
+        """Whether the judge ended training."""
+        return {"stopped": self.stopped}
+
+    def load_state_dict(self, state_dict: dict[str, bool]) -> None:
+        """Restores the decision."""
+        self.stopped = bool(state_dict["stopped"])

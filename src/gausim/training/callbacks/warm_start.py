@@ -2,7 +2,7 @@
 
 Rollouts from a state and a material at random do not resemble the videos, and images that do not overlap have no useful
 loss gradient. So the motion of every sequence is tracked without dynamics, in the modes of the template
-(:mod:`gausim.training.supervision.motion_tracker`), or taken from true points, and initial states, densities,
+(:mod:`gausim.training.supervision.motion_tracks`), or taken from true points, and initial states, densities,
 attributes and the template are fitted to it in modal coordinates (:mod:`gausim.training.modal_fit`). Training then
 starts from there, with the network.
 """
@@ -10,6 +10,7 @@ starts from there, with the network.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -139,7 +140,7 @@ class WarmStart(Callback):
             moved = tracks.displacements(sample).to(module.device)
             states.set_motion(number, moved[1])
             found.setdefault(sample.scene_id, []).append((sample, moved))
-        motions = [(i, _Known(module, states, i, tracked, self._sequences)) for i, tracked in found.items()]
+        motions = [(i, _known(module, states, i, tracked, self._sequences)) for i, tracked in found.items()]
         updates = math.ceil(self._updates * min(1.0, USUAL / last))
         with torch.enable_grad():
             losses = modal_fit.fit(
@@ -151,28 +152,26 @@ class WarmStart(Callback):
         print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
 
 
-class _Known:
-    """Tracked motion of the sequences of a scene, from their trained initial states."""
+def _known(
+    module: GausSimModule, states: InitialStates, scene_id: int, tracked: Tracked, most: int
+) -> Callable[[int], KnownMotion]:
+    """T frames of some of the sequences of a scene as they were tracked, from their trained initial states."""
+    draws, numbers = torch.Generator().manual_seed(0), [sample.sequence_id for sample, _ in tracked]
+    projection = cast(GausSim, module.model).modal_projection(scene_id).flatten(0, 1)
+    z = torch.stack([moved.flatten(1) @ projection for _, moved in tracked])
+    size = modal_fit.size_of(z[:, 1:])
+    found = [module.method.references(number, z.shape[1] - 1) for number in numbers]
+    loads = [torch.stack([cast(Tensor, units.load) for _, units in own]) for own in found if own is not None]
+    load = torch.stack(loads, 1) if loads else None
 
-    def __init__(
-        self, module: GausSimModule, states: InitialStates, scene_id: int, tracked: Tracked, most: int
-    ) -> None:
-        self._states, self._draws, self._most = states, torch.Generator().manual_seed(0), most
-        self._numbers = [sample.sequence_id for sample, _ in tracked]
-        self._projection = cast(GausSim, module.model).modal_projection(scene_id).flatten(0, 1)
-        self._z = torch.stack([moved.flatten(1) @ self._projection for _, moved in tracked])
-        self._size = modal_fit.size_of(self._z[:, 1:])
-        found = [module.method.references(number, self._z.shape[1] - 1) for number in self._numbers]
-        loads = [torch.stack([cast(Tensor, units.load) for _, units in own]) for own in found if own is not None]
-        self._load = torch.stack(loads, 1) if loads else None
+    def known(steps: int) -> KnownMotion:
+        rows = torch.randperm(len(numbers), generator=draws)[:most].tolist()
+        motion = torch.stack([states.motion(numbers[i]) for i in rows])
+        before, after = -motion.flatten(1) @ projection, z[rows, 1 : steps + 1].movedim(1, 0)
+        own = None if load is None else load[:steps, rows]
+        return KnownMotion(size[rows], before, torch.zeros_like(before), after, own)
 
-    def __call__(self, steps: int) -> KnownMotion:
-        """T = ``steps`` frames of some of the sequences."""
-        rows = torch.randperm(len(self._numbers), generator=self._draws)[: self._most].tolist()
-        motion = torch.stack([self._states.motion(self._numbers[i]) for i in rows])
-        before, after = -motion.flatten(1) @ self._projection, self._z[rows, 1 : steps + 1].movedim(1, 0)
-        load = None if self._load is None else self._load[:steps, rows]
-        return KnownMotion(self._size[rows], before, torch.zeros_like(before), after, load)
+    return known
 
 
 def _can_be_tracked(module: GausSimModule, data: ReadyDataModule) -> bool:

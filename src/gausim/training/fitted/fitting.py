@@ -13,7 +13,7 @@ from typing import Any, cast
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch.optim import Adam, Optimizer
 
 from gausim.core import FittedDynamics, FittedMethod, FittedState, GaussianScene, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
@@ -88,22 +88,6 @@ class Sequences(nn.Module):
         return {name: list(members) for name, members in self.method.parameter_groups().items()}
 
 
-class Penalties:
-    """Penalties of a stage, added to the rollout's loss."""
-
-    def __init__(self, method: FittedMethod, weights: Mapping[str, float]) -> None:
-        self._method, self._weights = method, weights
-
-    def descend(self, step: StepInputs) -> None:
-        """Backward pass over this rank's sequences, for the mean over all sequences of the step."""
-        if not self._weights:
-            return
-        for facts in step.whole[step.ranks.rank :: step.ranks.size]:
-            found = self._method.penalties(facts.sequence_id)
-            loss = torch.stack([weight * found[name] for name, weight in self._weights.items()]).sum()
-            step.backward(loss / len(step.whole))
-
-
 class StagedFit(Method):
     """A method with parameters for every sequence, fitted stage by stage.
 
@@ -145,8 +129,9 @@ class StagedFit(Method):
         return self.model.parameter_groups()
 
     def build(self, settings: OptimizerSettings) -> Optimizer | None:
-        """One optimiser over the groups of the method; the stages set their learning rates."""
-        return self.plan.build(self.groups())
+        """One optimiser over the groups of the method; the stages set their learning rates. None without stages."""
+        made = [{"params": own, "lr": 0.0, "name": name} for name, own in self.groups().items() if own]
+        return (self.plan.optimizer or Adam)(made) if made and self.plan.order else None
 
     def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
         """Enters the stage of the epoch and sets its learning rates; the largest is logged."""
@@ -172,7 +157,17 @@ class StagedFit(Method):
 
     def terms(self) -> Sequence[Term]:
         """The stage's penalties."""
-        return (Penalties(self.fitted, dict(self.plan.order)[self.stage].penalties),)
+        return (self._descend,)
+
+    def _descend(self, step: StepInputs) -> None:
+        """Backward pass of the penalties of this rank's sequences, for the mean over all sequences of the step."""
+        weights = dict(self.plan.order)[self.stage].penalties
+        if not weights:
+            return
+        for facts in step.whole[step.ranks.rank :: step.ranks.size]:
+            found = self.fitted.penalties(facts.sequence_id)
+            loss = torch.stack([weight * found[name] for name, weight in weights.items()]).sum()
+            step.backward(loss / len(step.whole))
 
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
         """The method's state at frame 0 of every sequence."""

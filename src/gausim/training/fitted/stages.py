@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 
 from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
@@ -111,11 +111,6 @@ class FitPlan:
                     raise ConfigError(
                         f"model.plan.stages.{name}.{what}: {unknown} asked for; the method has {sorted(there)}."
                     )
-
-    def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer | None:
-        """One optimiser over all groups; None without stages."""
-        made = [{"params": list(members), "lr": 0.0, "name": name} for name, members in groups.items() if members]
-        return (self.optimizer or Adam)(made) if made and self.order else None
 
     def place(self, epochs: float) -> tuple[str, Stage, float]:
         """The stage after ``epochs`` epochs of the plan, its name, and the iterations of it that are done."""

@@ -92,7 +92,8 @@ class TensorBoardLog(TensorBoardLogger):
     def _image(self, tag: str, encoded: bytes, step: int) -> None:
         from tensorboard.compat.proto.summary_pb2 import Summary
 
-        height, width = _size(encoded)
+        with Image.open(io.BytesIO(encoded)) as read:
+            width, height = read.size
         image = Summary.Image(encoded_image_string=encoded, height=height, width=width, colorspace=3)
         self.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
@@ -120,8 +121,3 @@ def _gif(video: Path) -> bytes:
         path = Path(folder) / "video.gif"
         write_gif(path, read_video(video), video_rate(video))
         return path.read_bytes()
-
-
-def _size(encoded: bytes) -> tuple[int, int]:
-    with Image.open(io.BytesIO(encoded)) as image:
-        return image.height, image.width

@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import MLFlowLogger
 
 from gausim.core import ConfigError
 from gausim.io.files import write_durably
+from gausim.runs.defaults import flatten
 from gausim.runs.names import MLFLOW_ID
 from gausim.runs.randomness import undisturbed
 from gausim.training.loggers.files import error_plot
@@ -83,7 +84,7 @@ class MlflowLog(MLFlowLogger):
             _ = super().experiment
         run = self._run_id or ""
         write_durably(id_file, run.encode())
-        params = [Param(_key(key), value[:_LONGEST_PARAM]) for key, value in _flat(self._config)]
+        params = [Param(_key(key), str(value)[:_LONGEST_PARAM]) for key, value in flatten(self._config)]
         for start in range(0, len(params), _PARAMS_AT_ONCE):
             client.log_batch(run, params=params[start : start + _PARAMS_AT_ONCE])
         client.log_text(run, yaml.safe_dump(self._config, sort_keys=False), "config.yaml")
@@ -123,9 +124,3 @@ class MlflowLog(MLFlowLogger):
 def _key(name: str) -> str:
     """A metric's name in characters that MLflow allows."""
     return "".join(c if c.isalnum() or c in "_-./ " else "_" for c in name)
-
-
-def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(value, Mapping) and value:
-        return [item for k, v in value.items() for item in _flat(v, f"{prefix}.{k}" if prefix else str(k))]
-    return [(prefix, str(value))]

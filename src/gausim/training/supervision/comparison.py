@@ -72,7 +72,7 @@ class Comparison:
 
         Only the losses are differentiable in the states; ``start`` is the number of frames predicted before.
         """
-        losses, motion = _Compare.apply(*states.tensors(), self, start)
+        losses, motion = _Compare.apply(*states, self, start)
         return losses, motion
 
     def chunks(self, steps: int) -> list[Chunk]:
@@ -96,7 +96,7 @@ class Comparison:
     def draw(self, chunk: Chunk, states: States) -> Float[Tensor, "M T V H W C"]:
         """Images of the states of a chunk, member by member; differentiable in the states."""
         group, units = self._groups[chunk.group], self._batch.members[chunk.members[0]].unit_of_kernel
-        drawn = draw(self._renderer, self._appearances[chunk.group], *states.tensors(), units, group.cameras)
+        drawn = draw(self._renderer, self._appearances[chunk.group], *states, units, group.cameras)
         images = channels(drawn.rgb, drawn.alpha, self._loss)
         return images.unflatten(0, (len(chunk.members), -1))
 

@@ -105,15 +105,10 @@ class ImageSupervision:
         self.begun: dict[int, Float[Tensor, "K 3"]] = {}
         self.begins: Callable[[SequenceSample], Float[Tensor, "K 3"] | None] = lambda sample: None
 
-    def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
-        """Rendering and image loss of the predictions of a batch."""
-        return self._comparison(samples, batch, slice(1, None))
-
-    def at_rest(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
-        """Rendering and image loss of one step from the rest state, against frame 0 of the samples."""
-        return self._comparison(samples, batch, slice(0, 1))
-
-    def _comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice) -> Comparison:
+    def comparison(
+        self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice = slice(1, None)
+    ) -> Comparison:
+        """Rendering and image loss of the predictions of a batch, against some ``frames`` of the samples."""
         places: dict[Hashable, list[int]] = {}
         for i, sample in enumerate(samples):
             places.setdefault(self._keys.of(sample), []).append(i)
@@ -134,12 +129,16 @@ class ImageSupervision:
         if first is not None:
             key, rest = (key, sample.sequence_id), first
         if key not in self._rest:
-            appearance = self.appearances.of(sample.scene_id, rest)
-            identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
-            units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
-            with torch.no_grad():
-                self._rest[key] = draw(self.renderer, appearance, rest[None], identity, identity, units, sample.cameras)
+            self._rest[key] = self.undeformed(sample, rest)
         return self._rest[key]
+
+    @torch.no_grad()
+    def undeformed(self, sample: SequenceSample, positions: Float[Tensor, "K 3"]) -> Rendered:
+        """Image of a sample's scene in its cameras, with undeformed kernels at some positions."""
+        appearance = self.appearances.of(sample.scene_id, positions)
+        identity = torch.eye(3, dtype=positions.dtype, device=positions.device)[None, None]
+        units = torch.zeros(len(positions), dtype=torch.long, device=positions.device)
+        return draw(self.renderer, appearance, positions[None], identity, identity, units, sample.cameras)
 
     @torch.no_grad()
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:

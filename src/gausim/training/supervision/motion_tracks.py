@@ -1,22 +1,188 @@
-"""Supervision by motion tracks: rollouts are compared with the tracked kernels in 3D.
+"""Supervision by motion tracks: kernel motion fitted to the videos, frame by frame, without any dynamics.
 
-Every part of the object has the same weight, with little texture or much, and nothing is rendered.
+A rollout can only show motion that its dynamics allow, so the loss gradient of its images mixes two questions: where
+the object is in this frame, and which forces bring it there. Tracking answers the first question alone. Each frame's
+coordinates in the model's smooth motions are those whose rendering agrees best with the frame,
+
+    q_t = argmin_q |draw(X + sum_m q_m phi_m) - frame_t|^2 + prior |q|^2,    q_0 = 0,
+
+(for a body in hands relative to its reference, :mod:`gausim.models.reference.held`,)
+found by Levenberg and Marquardt's method on images of falling blur, from an extrapolation of the two frames before; no
+dynamics are assumed. Its matrix J^T J is that of the rest state: the mean of g g^T over loss gradients g = J^T e for
+random images e. The motions phi are scaled to about equal elastic energy, so coordinates that no camera determines stay
+at rest.
+
+Rollouts are compared with the tracked kernels in 3D: every part of the object has the same weight, with little texture
+or much, and nothing is rendered.
 """
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from gausim.core import ConfigError, SmoothMotions
 from gausim.data.dataset import SequenceSample
+from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.models.reference.placed import Placed
-from gausim.training.supervision.images import Sources
-from gausim.training.supervision.motion_tracker import MotionTracker
+from gausim.models.reference.reference import Carried
+from gausim.ops.deformation import polar_rotation
+from gausim.render.draw import draw
+from gausim.training.supervision.comparison import channels
+from gausim.training.supervision.images import Appearances, Sources, ViewKeys
 from gausim.training.supervision.points import PointSupervision
+
+# Random images whose loss gradients give the curvature, and how many are drawn at a time.
+PROBES, TOGETHER = 256, 16
+# Levenberg and Marquardt's damping, in mean eigenvalues of the curvature: its start, and factors after a step that is
+# accepted and after one that is not.
+DAMPING, LESS, MORE = 0.1, 1 / 3, 4.0
+# Fewest pixels along an image's side.
+LEAST_SIDE = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Eigenvalues and vectors of J^T J of the images in a scene's coordinates, at rest."""
+
+    values: Float[Tensor, " M"]
+    vectors: Float[Tensor, "M M"]
+
+    def step(self, slope: Float[Tensor, " M"], damping: float) -> Float[Tensor, " M"]:
+        """(J^T J + damping I)^-1 slope."""
+        return self.vectors @ ((slope @ self.vectors) / (self.values + damping))
+
+
+class MotionTracker:
+    """Fits the coordinates of a scene's smooth motions frame by frame."""
+
+    def __init__(
+        self,
+        sources: Sources,
+        *,
+        iterations: int = 6,
+        pyramid: Sequence[int] = (8, 4, 2, 1),
+        momentum: float = 0.7,
+        prior: float = 0.01,
+    ) -> None:
+        """``conf/supervision/tracks.yaml`` explains the settings."""
+        if iterations < 1 or not pyramid or min(pyramid) < 1 or prior < 0:
+            raise ConfigError(
+                "supervision: expected iterations >= 1, pyramid of at least one factor >= 1 and prior >= 0, got "
+                f"iterations={iterations}, pyramid={list(pyramid)}, prior={prior}."
+            )
+        self._sources, self._iterations, self._pyramid = sources, iterations, tuple(pyramid)
+        self._momentum, self._prior = momentum, prior
+        self._motions: dict[int, SmoothMotions] = {}
+        self._appearances = Appearances(sources.scenes)
+        self._keys, self._curvatures = ViewKeys(), dict[Hashable, Curvature]()
+
+    def motions(self, scene_id: int) -> SmoothMotions:
+        """The smooth motions of a scene; raises ConfigError where the model has none."""
+        if scene_id not in self._motions:
+            found = self._sources.motions(scene_id)
+            if found is None:
+                raise ConfigError(
+                    "supervision: motion is tracked in the smooth motions that a model's template carries, and this "
+                    "model has none. Use supervision=images with it."
+                )
+            self._motions[scene_id] = found
+        return self._motions[scene_id]
+
+    def extend(self, known: Float[Tensor, "F M"] | None, sample: SequenceSample) -> Float[Tensor, "T M"]:
+        """Coordinates of all frames of a sample; those of its first F frames are ``known``.
+
+        A frame's coordinates depend on the earlier frames only, so the result is independent of the number of calls in
+        which a sequence is tracked.
+        """
+        motions = self.motions(sample.scene_id)
+        if known is None:
+            known = motions.kernels.new_zeros(1, motions.count)
+        frames = list(known.to(sample.frames.device))
+        references = self._sources.references(sample.sequence_id, sample.steps)
+        while len(frames) <= sample.steps:
+            guess = frames[-1]
+            if len(frames) > 1:
+                guess = guess + self._momentum * (frames[-1] - frames[-2])
+            carried = None if references is None else references[len(frames) - 1][0]
+            frames.append(self._find(sample, len(frames), guess, carried))
+        return torch.stack(frames)
+
+    def _find(
+        self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"], carried: Carried | None
+    ) -> Float[Tensor, " M"]:
+        target = channels(*composite(sample.frames[frame : frame + 1]), self._sources.loss)
+        place = guess
+        for factor in self._pyramid:
+            if factor == self._pyramid[-1] or min(target.shape[2:4]) >= LEAST_SIDE * factor:
+                place = self._descend(sample, factor, _shrunk(target, factor), place, carried)
+        return place
+
+    def _descend(
+        self,
+        sample: SequenceSample,
+        factor: int,
+        target: Float[Tensor, "1 V H W C"],
+        place: Float[Tensor, " M"],
+        carried: Carried | None,
+    ) -> Float[Tensor, " M"]:
+        """Steps of Levenberg and Marquardt's method on images reduced by a factor."""
+        curvature = self._curvature(sample, factor)
+        unit = float(curvature.values.mean())
+        prior, damping = self._prior * unit, DAMPING
+
+        def compare(place: Tensor) -> tuple[Tensor, Tensor]:
+            place = place.detach().requires_grad_()
+            off = _shrunk(self._drawn(sample, place[None], carried), factor) - target
+            error = 0.5 * (off.square().sum() + prior * place.square().sum())
+            return error.detach(), torch.autograd.grad(error, place)[0]
+
+        error, slope = compare(place)
+        for _ in range(self._iterations):
+            tried = place - curvature.step(slope, prior + damping * unit)
+            found, steepness = compare(tried)
+            if found < error:
+                place, error, slope, damping = tried, found, steepness, damping * LESS
+            else:
+                damping *= MORE
+        return place
+
+    def _drawn(
+        self, sample: SequenceSample, places: Float[Tensor, "B M"], carried: Carried | None = None
+    ) -> Float[Tensor, "B V H W C"]:
+        """Images of the scene at some coordinates; B is 1 where the reference moves."""
+        motions, appearance = self.motions(sample.scene_id).to(places), self._appearances.of(sample.scene_id, places)
+        rest = self._sources.scenes[sample.scene_id].means.to(places)
+        deformation_gradients = motions.deformations(places)
+        rotations = polar_rotation(deformation_gradients.detach())
+        state = Placed(rest + motions.displacements(places), deformation_gradients, rotations)
+        if carried is not None:
+            state = Placed(*(x[None] for x in carried.place(Placed(*(x[0] for x in state[:3])))[:3]))
+        drawn = draw(self._sources.renderer, appearance, *state[:3], motions.unit_of_kernel, sample.cameras)
+        return channels(drawn.rgb, drawn.alpha, self._sources.loss)
+
+    def _curvature(self, sample: SequenceSample, factor: int) -> Curvature:
+        """Curvature of a scene's images in the sample's cameras, reduced by a factor; computed once."""
+        key = self._keys.of(sample), factor
+        if key not in self._curvatures:
+            draws, like = torch.Generator().manual_seed(0), self.motions(sample.scene_id).kernels
+            slopes = []
+            for _ in range(0, PROBES, TOGETHER):
+                places = like.new_zeros(TOGETHER, self.motions(sample.scene_id).count).to(sample.frames.device)
+                images = _shrunk(self._drawn(sample, places.requires_grad_()), factor)
+                weights = torch.randn(images.shape, generator=draws).to(images)
+                slopes.append(torch.autograd.grad(images, places, weights)[0])
+            slope = torch.cat(slopes)
+            values, vectors = torch.linalg.eigh(slope.mT @ slope / len(slope))
+            self._curvatures[key] = Curvature(values.clamp_min(0), vectors)
+        return self._curvatures[key]
 
 
 class TrackSupervision(PointSupervision):
@@ -60,3 +226,11 @@ class TrackSupervision(PointSupervision):
     def load_state_dict(self, state: dict[int, Tensor]) -> None:
         """Restores the coordinates."""
         self._coordinates = dict(state)
+
+
+def _shrunk(images: Float[Tensor, "B V H W C"], factor: int) -> Float[Tensor, "B V h w C"]:
+    """Images reduced by the mean over squares of ``factor`` pixels."""
+    if factor == 1:
+        return images
+    small = F.avg_pool2d(images.flatten(0, 1).movedim(-1, 1), factor)
+    return small.movedim(1, -1).unflatten(0, images.shape[:2])

@@ -63,7 +63,10 @@ class PointSupervision:
                 self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
-        known = [_from(sample.start, truth, batch.rest) for sample, truth in zip(samples, truths, strict=True)]
+        known = [
+            GroundTruth(truth.rest.to(batch.rest), truth.positions[sample.start :].to(batch.rest))
+            for sample, truth in zip(samples, truths, strict=True)
+        ]
         return _PointComparison(batch, known, attached, scales, self._energy_weight, root=self._relative)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
@@ -76,13 +79,11 @@ class PointSupervision:
         return StaticFigures(scaled.tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
+        diagonal = self._scenes[sample.scene_id].diagonal
         if self._relative:
             truth = self.motion(sample)
-            return 1 / max(float(_squared(truth.positions - truth.rest).mean()), self._least(sample))
-        return (100 / self._scenes[sample.scene_id].diagonal) ** 2
-
-    def _least(self, sample: SequenceSample) -> float:
-        return (LEAST_SWING * self._scenes[sample.scene_id].diagonal) ** 2
+            return 1 / max(float(_squared(truth.positions - truth.rest).mean()), (LEAST_SWING * diagonal) ** 2)
+        return (100 / diagonal) ** 2
 
     def displacements(self, sample: SequenceSample) -> Float[Tensor, "F K 3"]:
         """Displacements of all kernels from rest, each that of its nearest point, frame 0 first [scene units]."""
@@ -167,8 +168,3 @@ def _nearest(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"]) -> Int[
 
 def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
     return vectors.square().sum(-1).mean(-1)
-
-
-def _from(start: int, truth: GroundTruth, like: Tensor) -> GroundTruth:
-    """The motion from frame ``start`` on, on the device of ``like``."""
-    return GroundTruth(truth.rest.to(like), truth.positions[start:].to(like))

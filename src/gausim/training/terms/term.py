@@ -1,16 +1,16 @@
-"""Interface of a loss term that does not need the rollout, and its inputs."""
+"""Inputs of a loss term that does not need the rollout."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.losses.objective import Objective
+from gausim.training.contracts import Simulator
 from gausim.training.ranks.ranks import Ranks
 from gausim.training.statistics import Statistics
 from gausim.training.supervision.images import ImageSupervision
@@ -24,6 +24,7 @@ class StepInputs:
     random numbers. ``rest_loss`` is the mean loss of the rest state on the frames of a sample: the unit of penalties.
     """
 
+    simulator: Simulator
     samples: Sequence[SequenceSample]
     whole: Sequence[SampleFacts]
     draws: torch.Generator
@@ -36,9 +37,5 @@ class StepInputs:
     diagonals: Sequence[float]
 
 
-@runtime_checkable
-class Term(Protocol):
-    """A loss term that does not need the rollout."""
-
-    def descend(self, step: StepInputs) -> None:
-        """Backward pass of the term, for the mean over all sequences of the step."""
+# Makes the backward pass of a term, for the mean over all sequences of the step.
+Term = Callable[[StepInputs], None]
