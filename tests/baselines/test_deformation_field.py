@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import torch
-from helpers.toy_object import toy_scene
+from helpers.fitted_methods import recorded, rolled
 
 from gausim.baselines.deformation_field import DeformationField
 from gausim.core import FittedMethod, SimState
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 
 def made(seen: int = 4, **sizes: int) -> DeformationField:
     torch.manual_seed(0)
     sizes = {"resolution": 6, "features": 8, "hidden": 16, **sizes}
-    return DeformationField(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=seen, **sizes)
+    return DeformationField(**recorded(seen=seen), **sizes)
 
 
 def test_it_begins_at_rest_and_satisfies_the_contract() -> None:
@@ -74,9 +74,8 @@ def test_it_learns_a_scene_that_moves_and_turns() -> None:
     optimizer = torch.optim.Adam([{"params": list(groups[n]), "lr": rate} for n, rate in rates.items()], eps=1e-15)
 
     def losses() -> list[torch.Tensor]:
-        state, found = field.begin(0), []
-        for x, turn in wanted:
-            state = field.advance(state)
+        found = []
+        for (x, turn), state in zip(wanted, rolled(field, 4)[1:], strict=True):
             by_turn = (state.deformation_gradients - turn).square() * free[:, None]
             found.append((state.positions - x).square().mean() + 0.1 * by_turn.mean())
         return found

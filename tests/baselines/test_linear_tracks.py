@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from helpers.fitted_methods import recorded, rolled
 from helpers.toy_object import toy_scene
 
 from gausim.baselines.linear_tracks import UNIT, LinearTracks
@@ -17,7 +18,7 @@ SEEN = 15
 
 def tracks(**options: int) -> LinearTracks:
     settings = {"anchors": 40, "neighbours": 12, "basis": 6, "modes": 2, **options}
-    return LinearTracks(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=SEEN, **settings)
+    return LinearTracks(**recorded(seen=SEEN), **settings)
 
 
 def swinging(method: LinearTracks) -> torch.Tensor:
@@ -45,10 +46,9 @@ def test_training_shows_the_tracks_and_evaluation_the_linear_model() -> None:
     method = tracks()
     coordinates, rest = swinging(method), toy_scene().means
     method.train()
-    state, energy = method.begin(0), method.penalties(0)["energy"]
+    states, energy = rolled(method, SEEN), method.penalties(0)["energy"]
     assert float(energy.detach()) == pytest.approx(float(coordinates[1 : SEEN + 1].square().sum(1).mean()), rel=1e-4)
-    for frame in range(1, SEEN + 1):
-        state = method.advance(state)
+    for frame, state in enumerate(states[1:], 1):
         motion = torch.einsum("m,mai->ai", coordinates[frame], method.get_buffer("basis_0"))
         torch.testing.assert_close(state.positions, method.anchors(0).positions(motion), atol=1e-6, rtol=0)
     (state.positions - rest).square().sum().backward()
@@ -68,11 +68,8 @@ def test_frames_beyond_the_first_two_follow_the_fit_not_the_tracks() -> None:
     swinging(method)
     method.eval()
     with torch.no_grad():
-        states = [method.begin(0)]
-        for _ in range(3):
-            states.append(method.advance(states[-1]))
         tracked = method.tracked(0)
-        shown = [s.inner[0][1] for s in states[1:]]
+        shown = [s.inner[0][1] for s in rolled(method, 3)[1:]]
     torch.testing.assert_close(shown[0], tracked[1])
     assert float((shown[2] - tracked[3]).abs().max()) > 0.05 * float(tracked[3].abs().max())
 

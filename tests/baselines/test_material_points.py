@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.fitted_methods import recorded, rolled
 from helpers.toy_object import toy_scene
 from torch import Tensor
 
@@ -31,7 +32,7 @@ from gausim.core import (
     Surroundings,
     TakesOver,
 )
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 TRUE = 1e5
 
@@ -47,12 +48,12 @@ def grouped(options: dict[str, Any], **groups: type) -> dict[str, Any]:
 def dreamer(scene: GaussianScene | None = None, **options: Any) -> PhysDreamer:
     options = {"particles": 36, "cells": 12, "young_modulus": TRUE, "poisson_ratio": 0.3, "density": 2000.0} | options
     options = grouped(options, material=Material, discretisation=Discretisation, modulus=ModulusField)
-    return PhysDreamer(scenes=[scene or toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+    return PhysDreamer(**recorded(scene or toy_scene()), **options)
 
 
 def gaussian(scene: GaussianScene | None = None, **options: Any) -> PhysGaussian:
     options = grouped({"cells": 14, "young_modulus": 3e4} | options, material=Material, discretisation=Discretisation)
-    return PhysGaussian(scenes=[scene or toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+    return PhysGaussian(**recorded(scene or toy_scene()), **options)
 
 
 def swaying(method: MaterialPoints, speed: float = 0.8) -> FittedState:
@@ -61,13 +62,6 @@ def swaying(method: MaterialPoints, speed: float = 0.8) -> FittedState:
     velocity = torch.zeros_like(driven.rest)
     velocity[:, 0] = speed * method.domain.side * driven.rest[:, 2] ** 2 * ~driven.pinned
     return replace(state, inner=(state.inner[0], velocity, *state.inner[2:]))
-
-
-def rolled(method: MaterialPoints, state: FittedState, frames: int) -> list[FittedState]:
-    states = [state]
-    for _ in range(frames):
-        states.append(method.advance(states[-1]))
-    return states
 
 
 def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
@@ -130,9 +124,9 @@ def test_what_begins_at_rest_stays_at_rest_and_what_is_held_stays(make: Callable
     assert isinstance(method, FittedMethod)
     rest, held = toy_scene().means, method.body(0).driven.held
     with torch.no_grad():
-        for state in rolled(method, method.begin(0), 3):
+        for state in rolled(method, 3):
             torch.testing.assert_close(state.positions, rest, rtol=0, atol=1e-6)
-        states = rolled(method, swaying(method), 5)
+        states = rolled(method, 5, swaying(method))
     assert int(held.sum()) == 10
     for state in states:
         assert torch.equal(state.positions[held], rest[held])
@@ -149,7 +143,7 @@ def test_physgaussian_moves_as_the_material_point_method_moves_its_scene() -> No
     solver = MPMSolver(particles, material, grid, TimeStep(1 / 24, courant=0.5))
     wanted = [ParticleState.at_rest(x, begun.inner[1])]
     with torch.no_grad():
-        states = rolled(method, begun, 4)
+        states = rolled(method, 4, begun)
         for frame in range(4):
             wanted.append(solver.advance(wanted[-1], frame))
     moved = float((mapping.to_scene(wanted[-1].positions) - scene.means).norm(dim=1).max())
@@ -164,11 +158,11 @@ def test_physgaussian_moves_as_the_material_point_method_moves_its_scene() -> No
 
 def observed(method: PhysDreamer, frames: int) -> list[Tensor]:
     with torch.no_grad():
-        return [state.positions for state in rolled(method, swaying(method), frames)]
+        return [state.positions for state in rolled(method, frames, swaying(method))]
 
 
 def misfit(method: PhysDreamer, targets: list[Tensor], frames: int, begun: FittedState | None = None) -> Tensor:
-    states = rolled(method, begun or method.begin(0), frames)[1:]
+    states = rolled(method, frames, begun)[1:]
     return torch.stack([(s.positions - t).square().mean() for s, t in zip(states, targets[1:], strict=False)]).sum()
 
 
@@ -191,17 +185,17 @@ def test_a_known_rayleigh_damping_is_found_again() -> None:
     assert set(method.parameter_groups()) == {"velocity", "modulus", "damping"}
     assert "a fitted Rayleigh damping of 2 / s" in method.notes()[-1]
     with torch.no_grad():
-        targets = [state.positions for state in rolled(truth, swaying(truth), 4)]
+        targets = [state.positions for state in rolled(truth, 4, swaying(truth))]
         kept = truth.kept(0)
-        undamped = rolled(dreamer(), swaying(dreamer()), 1)[-1]
-        damped = rolled(truth, swaying(truth), 1)[-1]
+        undamped = rolled(dreamer(), 1, swaying(dreamer()))[-1]
+        damped = rolled(truth, 1, swaying(truth))[-1]
     assert kept is not None and float(kept) == pytest.approx(math.exp(-6 / 24)) and dreamer().kept(0) is None
     energies = [float(state.inner[1].square().sum()) for state in (damped, undamped)]
     assert energies[0] < 0.8 * energies[1]
     optimizer = torch.optim.Adam(method.damping.parameters(), lr=0.1)
     for _ in range(15):
         optimizer.zero_grad()
-        states = rolled(method, swaying(method), 4)
+        states = rolled(method, 4, swaying(method))
         torch.stack([(s.positions - t).square().sum() for s, t in zip(states, targets, strict=True)]).sum().backward()
         optimizer.step()
     assert 10 ** abs(float(method.damping[0].detach()) - math.log10(6.0)) < 1.15

@@ -8,8 +8,7 @@ import torch
 from helpers.plain import plain_scene
 from scipy.spatial.transform import Rotation
 
-from gausim.baselines.ballistic import BallisticDynamics, rigid_fit
-from gausim.baselines.follow_hands import FollowHandsDynamics, hand_weights
+from gausim.baselines.references import BallisticDynamics, FollowHandsDynamics, hand_weights, rigid_fit
 from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
 
 FPS = 24.0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
+from helpers.fitted_methods import recorded, rolled
 from helpers.toy_object import toy_scene
 
 from gausim.baselines.deformation_field import DeformationField
@@ -17,20 +19,18 @@ from gausim.baselines.spring_gaus.spring_mass import ConstantVelocity, SpringMas
 from gausim.core import (
     ConfigError,
     DivergenceError,
-    FittedMethod,
-    FittedState,
     Floor,
     SceneError,
     SimState,
     Surroundings,
 )
 from gausim.core.fitted import FittedDynamics
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 
 def springs(**options: Any) -> SpringMass:
     options = {"anchors": 40, "neighbours": 24, "substeps": 20, "period": 8.0, **options}
-    return SpringMass(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+    return SpringMass(**recorded(), **options)
 
 
 def swaying(method: SpringMass, speed: float = 0.01) -> SpringMass:
@@ -38,13 +38,6 @@ def swaying(method: SpringMass, speed: float = 0.01) -> SpringMass:
         for velocity in method.velocity:
             velocity[:, 0] = speed * method.anchors(0).rest[:, 2]
     return method
-
-
-def rolled(method: FittedMethod, frames: int) -> list[FittedState]:
-    states = [method.begin(0)]
-    for _ in range(frames):
-        states.append(method.advance(states[-1]))
-    return states
 
 
 @pytest.mark.parametrize(
@@ -57,22 +50,19 @@ def rolled(method: FittedMethod, frames: int) -> list[FittedState]:
 )
 def test_surroundings_that_springs_do_not_know_are_refused(around: dict[str, Any], text: str) -> None:
     scene = replace(toy_scene(), surroundings=Surroundings(**around))
-    recorded: Any = {"scenes": [toy_scene(), scene], "fps": [24.0] * 2, "scene_of_sequence": [0, 1], "seen": 7}
     with pytest.raises(ConfigError, match=rf"spring_mass: 'toy' has {text} in its dataset.json, .*model=gausim"):
-        SpringMass(anchors=40, **recorded)
+        SpringMass(anchors=40, **recorded(toy_scene(), scene))
     if "free" not in around:
-        ConstantVelocity(anchors=40, **recorded)
+        ConstantVelocity(anchors=40, **recorded(toy_scene(), scene))
 
 
 def test_no_baseline_keeps_pins_in_place_that_hands_move() -> None:
     scene = toy_scene()
-    recorded: Any = {"fps": [24.0], "scene_of_sequence": [0], "seen": 7}
-    recorded["scenes"] = [replace(scene, hand=torch.where(scene.pinned, 0, -1))]
-    for method in (SpringMass, ConstantVelocity, LinearTracks):
+    held = recorded(replace(scene, hand=torch.where(scene.pinned, 0, -1)))
+    for method in (partial(SpringMass, anchors=40), partial(ConstantVelocity, anchors=40),
+                   partial(LinearTracks, anchors=40), DeformationField):  # fmt: skip
         with pytest.raises(ConfigError, match="'toy' has a 'grip' of hands"):
-            method(anchors=40, **recorded)
-    with pytest.raises(ConfigError, match="'toy' has a 'grip' of hands"):
-        DeformationField(**recorded)
+            method(**held)
 
 
 def test_kernels_follow_an_affine_motion_with_its_gradient() -> None:
@@ -92,12 +82,9 @@ def test_kernels_follow_an_affine_motion_with_its_gradient() -> None:
 
 def test_held_kernels_and_pinned_anchors_never_move() -> None:
     scene = toy_scene()
-    outside = torch.zeros(36, dtype=torch.bool)
-    outside[-1] = True
+    outside = torch.arange(36) == 35
     scene = replace(scene, simulated=~outside)
-    method = SpringMass(
-        scenes=[scene], fps=[24.0], scene_of_sequence=[0], seen=7, anchors=40, neighbours=20, substeps=20
-    )
+    method = SpringMass(**recorded(scene), anchors=40, neighbours=20, substeps=20)
     with torch.no_grad():
         method.velocity[0].normal_(std=0.02)
         states = rolled(method, 6)
@@ -177,7 +164,7 @@ def test_stiff_springs_get_more_substeps_and_too_stiff_ones_a_message() -> None:
 
 
 def test_constant_velocity_goes_on_for_ever() -> None:
-    method = ConstantVelocity(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0], seen=7, anchors=20)
+    method = ConstantVelocity(**recorded(), anchors=20)
     with torch.no_grad():
         method.velocity[0][:, 1] = 0.01
     rest = toy_scene().means
@@ -196,4 +183,4 @@ def test_wrong_settings_name_their_field() -> None:
     point = toy_scene()
     point = replace(point, means=torch.cat((point.means[:1].repeat(35, 1), point.means[1:2])))
     with pytest.raises(SceneError, match=r"toy: expected at least 4 occupied grid cells"):
-        SpringMass(scenes=[point], fps=[24.0], scene_of_sequence=[0], seen=7)
+        SpringMass(**recorded(point))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import toy_object
 
-from gausim.baselines.static import StaticDynamics
+from gausim.baselines.references import StaticDynamics
 from gausim.core import DataError, RunError, SimState, Trajectory
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation

@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
-from helpers.bodies import make_model, make_scene, permuted
+from helpers.bodies import make_model, make_scene
 
-from gausim.core import SceneError
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.ops.covariance import kernel_volumes
 
@@ -80,24 +77,3 @@ def test_root_is_the_nearest_pinned_kernel() -> None:
         for c in range(level.count):
             distance = (base.rest - level.rest[c]).norm(dim=-1).masked_fill(~base.pinned, float("inf"))
             assert int(level.root[c]) == int(distance.argmin())
-
-
-@pytest.mark.parametrize("clustering", ["agglomerative", "ball"])
-def test_permuting_kernels_permutes_the_clusters(clustering) -> None:
-    scene = make_scene(90, dtype=torch.float64)
-    order = torch.randperm(90, generator=torch.Generator().manual_seed(0))
-    plain = build_hierarchy(scene, radii=RADII, clustering=clustering)
-    other = build_hierarchy(permuted(scene, order), radii=RADII, clustering=clustering)
-    for number in range(1, 4):
-        label = torch.full((90,), -1)
-        label[plain.kernels] = plain.ancestor(0, number)
-        other_label = torch.full((90,), -1)
-        other_label[other.kernels] = other.ancestor(0, number)
-        assert torch.equal(other_label, label[order])
-        assert torch.allclose(other.levels[number].rest, plain.levels[number].rest, atol=1e-12)
-
-
-def test_scene_that_nothing_holds_is_refused() -> None:
-    scene = make_scene(40)
-    with pytest.raises(SceneError, match=r"column0: no kernel is pinned"):
-        build_hierarchy(dataclasses.replace(scene, pinned=torch.zeros_like(scene.pinned)), radii=RADII)

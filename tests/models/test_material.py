@@ -19,8 +19,8 @@ from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.template.body_modes import CURVED
 from gausim.models.template.material import Links, MaterialTemplate, PreparedMaterial
-from gausim.models.template.solid import solid_body
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.models.template.solid import SolidBody, solid_body
+from gausim.ops.rotation import quaternion_to_matrix
 
 
 def _template(hierarchy, *, seed: int = 0, **settings) -> MaterialTemplate:
@@ -42,15 +42,19 @@ def _material(hierarchy, *, seed: int = 1):
     return 0.5 * draw(count), draw(count, 3)
 
 
+def _solid(hierarchy) -> SolidBody:
+    """The body that the template is made from."""
+    kernels, level = hierarchy.levels[:2]
+    mass = (level.volume / level.volume[~level.pinned].mean()).double().numpy()
+    rest = [x.rest.double().numpy() for x in (kernels, level)]
+    return solid_body(rest[0], kernels.pinned.numpy(), rest[1], mass, level.pinned.numpy(),
+                      modes=9, spacing=0.2 * hierarchy.diagonal, curved=CURVED)  # fmt: skip
+
+
 def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
     template, level = _template(hierarchy), hierarchy.levels[1]
     body = template.body(0)
-    arguments = [x.double().numpy() for x in (hierarchy.levels[0].rest, level.rest)]
-    mass = (level.volume / level.volume[~level.pinned].mean()).double().numpy()
-    expected = solid_body(
-        arguments[0], hierarchy.levels[0].pinned.numpy(), arguments[1], mass, level.pinned.numpy(),
-        modes=9, spacing=0.2 * hierarchy.diagonal, curved=CURVED,
-    )  # fmt: skip
+    expected = _solid(hierarchy)
     values = torch.from_numpy(expected.values / expected.values[0])
     torch.testing.assert_close(body.stiffness.sum((0, 1)), torch.diag(values), atol=1e-4, rtol=1e-4)
     root = body.inertia.flatten(0, 1)
@@ -153,13 +157,7 @@ def test_a_load_acts_on_the_learned_masses() -> None:
 
 def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous_one(hierarchy) -> None:
     """An even strain S of an evenly stiffer body: minus the integral of the stress of S against the modes' strain."""
-    template, level, kernels = _template(hierarchy), hierarchy.levels[1], hierarchy.levels[0]
-    rest, pinned = level.rest.double().numpy(), level.pinned.numpy()
-    mass = (level.volume / level.volume[~level.pinned].mean()).double().numpy()
-    size = 0.2 * hierarchy.diagonal
-    body = solid_body(
-        kernels.rest.double().numpy(), kernels.pinned.numpy(), rest, mass, pinned, modes=9, spacing=size, curved=CURVED
-    )
+    template, body, count = _template(hierarchy), _solid(hierarchy), hierarchy.levels[1].count
     slope = torch.from_numpy(body.at(body.centres)[1])
     even = torch.tensor([[0.3, 0.1, 0.0], [0.1, -0.2, 0.05], [0.0, 0.05, 0.1]], dtype=torch.float64)
     lame, shear = 0.3 / (1.3 * 0.4), 1 / 2.6  # of Young's modulus 1 and Poisson's ratio 0.3
@@ -167,9 +165,9 @@ def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous
     expected = -torch.einsum("q,qabm,ab->m", torch.from_numpy(body.weights), slope, stress) / body.values[0]
     matrices = template.matrices(0, *(0.0 * x for x in _material(hierarchy)), 1 / 24)
     assert not matrices.uneven.any()
-    uneven = torch.tensor([0.7, 0.2]).double().expand(len(rest), 2)
+    uneven = torch.tensor([0.7, 0.2]).double().expand(count, 2)
     part = PreparedMaterial(template.body(0), replace(matrices, uneven=uneven, tense=0 * matrices.tense), 1.0)
-    load = torch.cat((torch.zeros(3), even.flatten())).double().expand(1, len(rest), 12)
+    load = torch.cat((torch.zeros(3), even.flatten())).double().expand(1, count, 12)
     torch.testing.assert_close(part.force(load)[0], expected, atol=1e-5, rtol=1e-4)
 
 

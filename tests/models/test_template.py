@@ -6,6 +6,8 @@ import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state
 
+from gausim.models.step import predictor
+from gausim.models.step.features import network_inputs
 from gausim.models.template.template import PreparedTemplate, Template, TemplateState
 
 
@@ -81,44 +83,36 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children() -
 
 @pytest.mark.parametrize("coarse", [False, True])
 @torch.no_grad()
-def test_the_network_sees_accelerations_and_velocities_in_diagonals(coarse) -> None:
+def test_inputs_are_made_of_the_centres_of_mass_and_of_the_solved_parents(coarse, monkeypatch) -> None:
     scene, gravity = make_scene(90, dtype=torch.float64), torch.tensor([0.5, 0.0, -4.0], dtype=torch.float64)
     model = make_model(scene, coarse_inputs=coarse, gravity=gravity.tolist(), output_scale=5.0, edges="rest")
-    nodes, edges = [], []
-    model.predictor.node_normaliser.register_forward_pre_hook(lambda _, inputs: nodes.append(inputs[0]))
-    model.predictor.edge_normaliser.register_forward_pre_hook(lambda _, inputs: edges.append(inputs[0]))
+    asked = []
+
+    def inputs(*given, **options):
+        asked.append((given, options["coarse"]))
+        return network_inputs(*given, **options)
+
+    monkeypatch.setattr(predictor, "network_inputs", inputs)
     state = make_state(scene)
     step = model.step(model.batch((0,)), state)
-
-    hierarchy, dt = model.hierarchies[0], 1 / 24.0
-    mass = model.masses(model.batch((0,)))[0]
-
-    def centres(values, number):
-        unit = hierarchy.ancestor(0, number)
-        rows = [unit == c for c in range(hierarchy.levels[number].count)]
-        x = values[hierarchy.kernels]
-        return torch.stack([(mass[r, None] * x[r]).sum(0) / mass[r].sum() for r in rows])
-
-    rest, now, before = ({n: centres(v, n) for n in (1, 2)} for v in (scene.means, state.positions, state.previous))
-    root = scene.means[hierarchy.kernels][hierarchy.levels[2].root]
-    after = root + (step.predicted[0] @ (rest[2] - root)[..., None])[..., 0]
-    size, parent = hierarchy.diagonal, hierarchy.levels[1].parent
-    # Top level: the root does not accelerate, so gravity alone; velocity against a point that stands still.
-    assert torch.allclose(nodes[0][:, :3], (gravity / size).expand(len(root), 3))
-    assert torch.allclose(nodes[0][:, 3:6], (now[2] - before[2]) / dt / size)
-    inertial = gravity - (after - 2 * now[2] + before[2]) / dt**2
-    assert torch.allclose(nodes[1][:, :3], inertial[parent] / size, atol=1e-9)
-    carried = (step.predicted[0][parent] @ (rest[1] - rest[2][parent])[..., None])[..., 0]
-    local = carried if coarse else now[1] - now[2][parent]
-    assert torch.allclose(nodes[1][:, 3:6], (local - (before[1] - before[2][parent])) / dt / size, atol=1e-9)
-    density = torch.stack(
-        [mass[hierarchy.ancestor(0, 1) == c].sum() / hierarchy.levels[1].volume[c] for c in range(len(parent))]
-    )
-    assert torch.allclose(nodes[1][:, 6], density.log())
-    source, destination = model.batch((0,)).levels[1].rest_edges
-    current = after[parent] + carried if coarse else now[1]
-    offset = current[destination] - current[source]
-    ratio = offset.norm(dim=-1) / (rest[1][destination] - rest[1][source]).norm(dim=-1)
-    assert torch.allclose(edges[1][:, 0], ratio, rtol=1e-6)
-    earlier = before[1][destination] - before[1][source]
-    assert torch.allclose(edges[1][:, 4:7], (offset - earlier) / dt / size, atol=1e-9)
+    hierarchy, mass = model.hierarchies[0], model.masses(model.batch((0,)))[0]
+    above = root = scene.means[hierarchy.kernels][hierarchy.levels[2].root]
+    for number, (given, coarsely), gradient in zip((2, 1), asked, step.predicted, strict=True):
+        unit, target, parents, edges, size, dt, pull, _ = given
+        members = [hierarchy.ancestor(0, number) == c for c in range(hierarchy.levels[number].count)]
+        for found, values in ((unit.rest, scene.means), (unit.now, state.positions), (unit.before, state.previous)):
+            x = values[hierarchy.kernels]
+            expected = torch.stack([(mass[own, None] * x[own]).sum(0) / mass[own].sum() for own in members])
+            torch.testing.assert_close(found, expected)
+        density = torch.stack([mass[own].sum() for own in members]) / hierarchy.levels[number].volume
+        torch.testing.assert_close(unit.log_density.exp(), density)
+        torch.testing.assert_close((target, parents.after[parents.index]), (unit.rest, above))
+        assert coarsely == (coarse and number == 1) and torch.equal(pull, gravity)
+        assert torch.equal(edges, model.batch((0,)).levels[2 - number].rest_edges)
+        torch.testing.assert_close((size, dt), tuple(torch.full_like(size, x) for x in (hierarchy.diagonal, 1 / 24)))
+        if number == 2:  # roots do not move
+            assert all(torch.equal(x, root) for x in (parents.rest, parents.now, parents.before))
+            after = root + (gradient @ (unit.rest - root)[..., None])[..., 0]
+            above, coarser = after[hierarchy.levels[1].parent], unit
+        else:
+            torch.testing.assert_close((parents.now, parents.before), (coarser.now, coarser.before))

@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from gausim.core import ConfigError
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import mlp, zero_output
 
@@ -49,37 +50,64 @@ def _single(network: MeshGraphNet, inputs: Graph) -> Graph:
     return inputs[0].float(), inputs[1].float(), inputs[2]
 
 
-def _textbook(network: MeshGraphNet, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
-    """The function of a network in plain torch, its edge update one linear layer on [edge, source, destination].
+def _edge_update(layer: nn.Module, joined: Tensor) -> Tensor:
+    """The MLP on [edge, source, destination]; the first matrix of the split form is composed of its three."""
+    if hasattr(layer, "edge"):
+        return layer.edge(joined)
+    weight = torch.cat((layer.from_edge.weight, *layer.from_nodes.weight.chunk(2)), 1)
+    hidden = nn.functional.linear(joined, weight, layer.from_edge.bias)
+    return layer.edge_out(nn.functional.silu(hidden))
 
-    This is equation 1 of Pfaff et al. (2021); the layer's matrix is composed of the three of the split form.
-    """
-    nodes, edges = network.node_encoder(nodes), network.edge_encoder(edges)
-    source, destination = edge_index
+
+def _by_hand(network: MeshGraphNet, nodes: Tensor, edges: Tensor, edge_index: Tensor, norm: str = "pre") -> Tensor:
+    """Equation 1 of Pfaff et al. (2021), one edge and one node at a time."""
+    x, e = list(network.node_encoder(nodes)), list(network.edge_encoder(edges))
     for layer in network.processor:
-        normed = layer.node_norm(nodes)
-        weight = torch.cat((layer.from_edge.weight, *layer.from_nodes.weight.chunk(2)), 1)
-        joined = torch.cat((layer.edge_norm(edges), normed[source], normed[destination]), 1)
-        hidden = torch.nn.functional.linear(joined, weight, layer.from_edge.bias)
-        edges = edges + layer.edge_out(torch.nn.functional.silu(hidden))
-        received = torch.zeros_like(nodes).index_add(0, destination, edges)
-        nodes = nodes + layer.node(torch.cat((normed, received), 1))
-    return network.decoder(network.norm(nodes))
+        norms, none = (layer.node_norm, layer.edge_norm), (nn.Identity(), nn.Identity())
+        before, after = norms if norm == "pre" else none, norms if norm == "post" else none
+        seen = [before[0](v) for v in x]
+        for k, (s, d) in enumerate(edge_index.T):
+            if norm == "joint":
+                e[k] = e[k] + layer.edge(layer.edge_norm(torch.cat((e[k], x[d], x[s]))))
+                continue
+            e[k] = e[k] + after[1](_edge_update(layer, torch.cat((before[1](e[k]), seen[s], seen[d]))))
+        for i in range(len(x)):
+            received = sum((e[k] for k in range(len(e)) if edge_index[1, k] == i), torch.zeros_like(x[i]))
+            if norm == "joint":
+                x[i] = x[i] + layer.node(layer.node_norm(torch.cat((x[i], received))))
+                continue
+            x[i] = x[i] + after[0](layer.node(torch.cat((seen[i], received))))
+    return network.decoder(network.norm(torch.stack(x)))
 
 
-def test_equals_the_textbook_form_in_values_and_gradients() -> None:
-    network, inputs = _network(), _inputs()
-    wanted = _differentiated(lambda *x: _textbook(network, *x), network, inputs)
-    for got, value in zip(_differentiated(network, network, inputs), wanted, strict=True):
+@pytest.mark.parametrize(
+    ("norm", "activation"), [("pre", "silu"), ("post", "silu"), ("pre", "relu"), ("joint", "silu")]
+)
+def test_layers_equal_the_same_by_hand_in_values_and_gradients(norm: str, activation: str) -> None:
+    choice = {"norm": norm, "activation": activation}
+    network, inputs = _network(**choice), _inputs()
+    assert any(isinstance(m, nn.ReLU) for m in network.processor.modules()) == (activation == "relu")
+    wanted = _differentiated(lambda *x: _by_hand(network, *x, norm), network, inputs)
+    found = _differentiated(network, network, inputs)
+    for got, value in zip(found, wanted, strict=True):
         assert float(value.abs().max()) > 0
         assert torch.allclose(got, value, rtol=0, atol=1e-10 * max(1.0, float(value.abs().max())))
-    with torch.no_grad():
-        assert torch.allclose(network(*inputs), wanted[0], rtol=0, atol=1e-12)
+    recomputed = _network(**choice, checkpoint=True)
+    again = _differentiated(recomputed, recomputed, inputs)
+    assert all(torch.equal(a, b) for a, b in zip(again, found, strict=True))
 
 
-def test_float32_equals_the_textbook_form_in_float64() -> None:
+@pytest.mark.parametrize(
+    ("name", "value", "known"), [("norm", "layer", "pre, post"), ("activation", "tanh", "silu, relu")]
+)
+def test_unknown_choices_are_refused(name: str, value: str, known: str) -> None:
+    with pytest.raises(ConfigError, match=rf"model\.simulator\.network\.{name} is '{value}'; expected one of {known}"):
+        _network(**{name: value})
+
+
+def test_float32_equals_float64() -> None:
     network, inputs = _network(hidden=64), _inputs(80, 300)
-    wanted = _differentiated(lambda *x: _textbook(network, *x), network, inputs)
+    wanted = _differentiated(network, network, inputs)
     single = _single(network, inputs)
     for got, value in zip(_differentiated(network, network, single), wanted, strict=True):
         assert got.dtype == torch.float32
@@ -133,6 +161,7 @@ def test_state_does_not_depend_on_how_it_is_computed() -> None:
 _COMPILED = """
 import copy, json, pickle, sys
 import torch
+from gausim.core import ConfigError
 from gausim.nn.meshgraphnet import MeshGraphNet
 
 how, tolerance = json.loads(sys.argv[1]), float(sys.argv[2])
@@ -163,7 +192,7 @@ def test_graph_without_edges() -> None:
     network, empty = _network(), (torch.zeros(0, 5, dtype=torch.float64), torch.zeros(2, 0, dtype=torch.long))
     nodes = _inputs()[0]
     outputs, by_node, by_edge, *rest = _differentiated(network, network, (nodes, *empty))
-    assert torch.allclose(outputs, _textbook(network, nodes, *empty), atol=1e-12)
+    assert torch.allclose(outputs, _by_hand(network, nodes, *empty), atol=1e-12)
     assert bool(by_node.abs().max() > 0) and by_edge.shape == (0, 5)
     assert all(bool(torch.isfinite(value).all()) for value in rest)
 

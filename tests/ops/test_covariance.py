@@ -5,7 +5,7 @@ import math
 import torch
 
 from gausim.ops.covariance import covariance_from_scales, kernel_volumes, transport_covariance
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 G = torch.Generator().manual_seed(0)
 LOG_SCALES = torch.randn(12, 3, generator=G, dtype=torch.float64) * 0.5 - 2

@@ -22,37 +22,22 @@ def test_mass_on_gives_determinant_one_for_large_outputs(scale: float, dtype: to
     assert (gradient - torch.eye(3, dtype=dtype)).abs().amax((-1, -2)).min() > 1e-2  # no trivial identity
 
 
-def test_without_mass_conservation_leaves_the_product_of_the_clamped_stretches() -> None:
-    output = _outputs(4.0)
-    gradient, _ = deformation_gradient_from_output(output, conserve_mass=False)
-    expected = output[:, 8:].clamp(-5, 5).sum(-1)
-    assert torch.allclose(torch.linalg.det(gradient).log(), expected, atol=1e-6)
-    assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
-
-
-def test_it_is_u_times_stretches_times_v_transposed() -> None:
-    output = _outputs(1.0)
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_it_is_u_times_clamped_stretches_times_v_transposed(scale: float) -> None:
+    output = _outputs(scale)
     gradient, rotation = deformation_gradient_from_output(output, conserve_mass=False)
     first = np.array([1.0, 0, 0, 0])
     u, v = (Rotation.from_quat(q.numpy() + first, scalar_first=True).as_matrix() for q in output[:, :8].split(4, 1))
     stretches = output[:, 8:].clamp(-5, 5).exp().numpy()
-    np.testing.assert_allclose(gradient, np.einsum("nij,nj,nkj->nik", u, stretches, v), atol=1e-10)
+    np.testing.assert_allclose(gradient, np.einsum("nij,nj,nkj->nik", u, stretches, v), rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(rotation, u @ v.transpose(0, 2, 1), atol=1e-12)
+    assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
 
 
 def test_zero_output_is_the_identity() -> None:
     for conserve in (True, False):
         for value in deformation_gradient_from_output(torch.zeros(4, 11), conserve_mass=conserve):
             assert torch.equal(value, torch.eye(3).expand(4, 3, 3))
-
-
-def test_second_result_is_the_polar_rotation_of_the_first() -> None:
-    gradient, rotation = deformation_gradient_from_output(_outputs(1.0), conserve_mass=True)
-    eye = torch.eye(3, dtype=torch.float64)
-    assert torch.allclose(rotation @ rotation.mT, eye.expand_as(rotation), atol=1e-12)
-    stretch = rotation.mT @ gradient
-    assert torch.allclose(stretch, stretch.mT, atol=1e-10)
-    assert torch.linalg.eigvalsh(stretch).min() > 0
 
 
 def test_gradcheck_of_the_head() -> None:

@@ -6,7 +6,7 @@ import torch
 from gausim.core import GaussianScene
 from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.deformed_scene import deformed_scene, matrix_to_quaternion, rotate_sh
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 
 

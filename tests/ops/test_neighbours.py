@@ -8,8 +8,6 @@ import torch
 from gausim.ops.neighbours import (
     batched_radius_edges,
     coded_edges,
-    combine_codes,
-    edge_codes,
     neighbour_codes,
     no_edge,
     radius_edges,
@@ -109,22 +107,6 @@ def test_positions_that_are_not_finite_are_refused() -> None:
     points[3, 1] = float("nan")
     with pytest.raises(ValueError, match="1 of 139 positions are NaN or infinite"):
         batched_radius_edges(points, offsets, RADII, 4)
-
-
-@pytest.mark.parametrize("rule", ["union", "intersection"])
-def test_codes_combine_as_sets(rule: str) -> None:
-    points, offsets, member = _union(3)
-    count = len(points)
-    moved = points + 0.05 * torch.rand(points.shape, generator=torch.Generator().manual_seed(4))
-    a, b = (batched_radius_edges(x, offsets, RADII, 5) for x in (points, moved))
-    sets = [set(zip(e[1].tolist(), e[0].tolist(), strict=True)) for e in (a, b)]
-    expected = sorted(sets[0] | sets[1] if rule == "union" else sets[0] & sets[1])
-    assert 0 < len(expected) != a.shape[1]
-    fixed = neighbour_codes(moved, member, RADII, 5)  # with codes of no edge among them
-    for codes in (edge_codes(b, count), fixed):
-        combined = combine_codes(edge_codes(a, count), codes, count, rule=rule)
-        assert combined.shape == (a.shape[1] + len(codes),)
-        assert [(d, s) for s, d in _edges(combined, count).T.tolist()] == expected
 
 
 @pytest.mark.gpu

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, Rendered, Trajectory
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import SceneAppearance, deformed_appearance, draw, film

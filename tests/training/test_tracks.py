@@ -17,7 +17,7 @@ from gausim.core import ConfigError, GaussianScene, HandPath, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.losses import ImageLoss
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.reference.placed import Placed
+from gausim.models.reference.reference import Placed
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops.deformation import polar_rotation

@@ -8,7 +8,7 @@ after the trained frames the motion repeats from frame 0, as in the original.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Unpack
+from typing import Unpack, cast
 
 import torch
 from jaxtyping import Float
@@ -17,8 +17,9 @@ from torch.nn import Parameter
 
 from gausim.baselines.fitted import Fitted, Recorded
 from gausim.core import FittedState
+from gausim.nn.mlp import zero_output
 from gausim.nn.planes import Planes
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 
 class Field(nn.Module):
@@ -46,9 +47,9 @@ class Field(nn.Module):
 
 def _head(hidden: int, size: int) -> nn.Sequential:
     last = nn.Linear(hidden, size)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
-    return nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
+    head = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
+    zero_output(head)
+    return head
 
 
 class DeformationField(Fitted):
@@ -114,7 +115,7 @@ class DeformationField(Fitted):
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``planes`` and ``layers`` of the fields; ``means``, ``scales``, ``rotations`` of the refined rest states."""
-        fields = [field for field in self.fields if isinstance(field, Field)]
+        fields = [cast(Field, field) for field in self.fields]
         return {
             "planes": [p for field in fields for p in field.planes.parameters()],
             "layers": [p for field in fields for part in (field.trunk, field.heads) for p in part.parameters()],
@@ -125,6 +126,5 @@ class DeformationField(Fitted):
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """``variation`` of the planes in space and their ``unsteadiness`` in time."""
-        field = self.fields[sequence_id]
-        assert isinstance(field, Field)
-        return {"variation": field.planes.variation(), "unsteadiness": field.planes.unsteadiness()}
+        planes = cast(Field, self.fields[sequence_id]).planes
+        return {"variation": planes.variation(), "unsteadiness": planes.unsteadiness()}

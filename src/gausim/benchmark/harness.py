@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from gausim import __version__
-from gausim.kernels.operations import plain_forms
 from gausim.runs import provenance
 from gausim.runs.cost import process_memory
 
@@ -85,16 +84,6 @@ def medians(
             else:
                 times[name].append(seconds)
     return {name: statistics.median(values) for name, values in times.items()}
-
-
-def plainly(call: Callable[[], object], names: Sequence[str] | None = None) -> Callable[[], None]:
-    """The call with the operations ``names`` in their plain form, all of them when None."""
-
-    def plain() -> None:
-        with plain_forms(names):
-            call()
-
-    return plain
 
 
 class _Kept:

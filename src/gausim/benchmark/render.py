@@ -42,8 +42,8 @@ def run(options: Options) -> list[Row]:
     return rows + _first_call(*cases[-1])
 
 
-def _name(count: int, size: int) -> str:
-    return f"render, {count} kernels, {size} x {size}"
+def _name(count: int, size: int, measured: str = "render") -> str:
+    return f"{measured}, {count} kernels, {size} x {size}"
 
 
 def _against_torch(name: str, scene: Splats, options: Options) -> list[Row]:
@@ -81,10 +81,7 @@ def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
 
 def _first_call(count: int, size: int) -> list[Row]:
     """First calls in new processes, with an empty and with a filled cache of compiled code."""
-    name, text = (
-        f"first call, {count} kernels, {size} x {size}",
-        "forward + backward in a new process, beyond its imports",
-    )
+    name, text = _name(count, size, "first call"), "forward + backward in a new process, beyond its imports"
     with tempfile.TemporaryDirectory() as cache:
         return [Row(name, s, in_fresh_process(count, size, cache), "s", text) for s in ("compiles", "cached")]
 

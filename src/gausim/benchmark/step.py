@@ -140,7 +140,7 @@ def _bent(batch: SceneBatch, amount: float) -> Tensor:
     """Positions (K, 3) of the batch's scenes bent sideways, so that some neighbours differ from those at rest."""
     height = batch.rest[:, 2] - batch.rest[:, 2].min()
     bent = batch.rest + torch.stack((amount * height**2, torch.zeros_like(height), torch.zeros_like(height)), 1)
-    return torch.where((batch.kernels.unit < 0)[:, None], batch.rest, bent)
+    return torch.where((batch.inherited < 0)[:, None], batch.rest, bent)
 
 
 class Bound:

@@ -9,19 +9,10 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
-from gausim.benchmark.harness import (
-    Options,
-    Row,
-    medians,
-    peak_resident,
-    peak_saved_bytes,
-    plainly,
-    spent_in,
-    torch_threads,
-)
+from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes, spent_in, torch_threads
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
-from gausim.kernels.operations import OPERATIONS
+from gausim.kernels.operations import OPERATIONS, plain_forms
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.comparison import Comparison
 
@@ -94,8 +85,8 @@ def _speed(name: str, case: _Case, rivals: Mapping[str, _Case], options: Options
     parts = _parts(case, options)
     parts["static loss (by its fraction of the batches)"] = static
     parts["rest"] = whole - sum(parts.values())
-    compared: dict[str, Callable[[], object]] = {form: plainly(case.step, [form]) for form in OPERATIONS}
-    compared |= {"own": case.step, "plain": plainly(case.step)}
+    compared: dict[str, Callable[[], object]] = {form: plain_forms([form])(case.step) for form in OPERATIONS}
+    compared |= {"own": case.step, "plain": plain_forms()(case.step)}
     compared |= {setting: rival.step for setting, rival in rivals.items()}
     found = medians(compared, options, rounds=min(REFERENCE_ROUNDS, options.rounds))
     own = found["own"] + static

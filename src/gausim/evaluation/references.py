@@ -10,9 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.baselines.ballistic import BallisticDynamics, rigid_fit
-from gausim.baselines.follow_hands import FollowHandsDynamics
-from gausim.baselines.static import StaticDynamics
+from gausim.baselines.references import BallisticDynamics, FollowHandsDynamics, StaticDynamics, rigid_fit
 from gausim.core import GaussianScene, SimState, Trajectory
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
@@ -23,9 +21,9 @@ from gausim.results.curves import BALLISTIC, FOLLOW_HANDS, STATIC, TRUTH
 class Reference:
     """The reference prediction of an object.
 
-    * ``follow hands``, of a body in hands: :class:`gausim.baselines.follow_hands.FollowHandsDynamics`.
+    * ``follow hands``, of a body in hands: :class:`gausim.baselines.references.FollowHandsDynamics`.
     * ``ballistic``, of a free body whose motion is known: seen frames are the rigid flight from the true frames 0 and 1
-      on, unseen ones that from the last two seen frames on (:class:`gausim.baselines.ballistic.BallisticDynamics`).
+      on, unseen ones that from the last two seen frames on (:class:`gausim.baselines.references.BallisticDynamics`).
     * ``static``, of all others: the rest state.
 
     Attributes:

@@ -18,9 +18,8 @@ import torch
 from numba.cpython.unsafe.tuple import tuple_setitem
 from torch import Tensor
 
-from gausim.kernels.constants import SSIM_C1, SSIM_C2
 from gausim.kernels.jit import HELPER, KERNEL
-from gausim.kernels.operations import array
+from gausim.kernels.operations import SSIM_C1, SSIM_C2, array
 from gausim.kernels.pool import shared_pool
 
 C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)

@@ -21,6 +21,8 @@ from gausim.kernels.announce import announced
 
 P = ParamSpec("P")
 R = TypeVar("R")
+# Constants of SSIM in both of its forms: (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1.
+SSIM_C1, SSIM_C2 = 1e-4, 9e-4
 OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.kernels.constants import SSIM_C1, SSIM_C2
-from gausim.kernels.operations import operation
+from gausim.kernels.operations import SSIM_C1, SSIM_C2, operation
 
 # Pixels of the authors' 960 x 540 frames; their sums over pixels are the mean times this number at any image size.
 REFERENCE_PIXELS = 518_400

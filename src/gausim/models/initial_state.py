@@ -48,9 +48,9 @@ class InitialStates(nn.Module, ABC):
     def motion(self, sequence_id: int) -> Float[Tensor, "K 3"]:
         """o, the displacement of x_{-1} from the rest state, reversed [scene units]."""
 
-    @abstractmethod
     def start(self, sequence_id: int) -> Float[Tensor, " 12"]:
-        """Translation, rotation, velocity and spin of a free body: a part of its parameter."""
+        """Translation, rotation, velocity and spin of a free body: the last numbers of its parameter."""
+        return self.parameter(sequence_id).flatten()[-START:]
 
     @abstractmethod
     def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
@@ -113,10 +113,6 @@ class FreeInitialStates(InitialStates):
         free = self._free[scene].to(offset.device)
         return -torch.where(free, offset * self._diagonal[scene], torch.zeros_like(offset))
 
-    def start(self, sequence_id: int) -> Float[Tensor, " 12"]:
-        """The last four rows."""
-        return self.offset[sequence_id][-START // 3 :].view(START)
-
     @torch.no_grad()
     def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
         """Takes the motion of every kernel."""
@@ -171,17 +167,17 @@ class ModalInitialStates(InitialStates):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Also of other machines, whose eigenvectors may have other signs, and of checkpoints without signatures."""
-        for scene_id, basis in enumerate(self._basis):
+        for scene_id in range(len(self._basis)):
             name = f"{prefix}signature_{scene_id}"
             own = self.get_buffer(f"signature_{scene_id}")
             saved = state_dict.get(name, own).to(own)
             state_dict[name] = own
-            flipped = (
-                (saved * own).sum(0) < 0 if saved.shape == own.shape else torch.zeros(own.shape[1], dtype=torch.bool)
-            )
+            if saved.shape != own.shape:
+                continue
+            flipped = (saved * own).sum(0) < 0
             for sequence_id, scene in enumerate(self.scene_of_sequence):
                 velocity = state_dict.get(f"{prefix}velocity.{sequence_id}")
-                if scene == scene_id and velocity is not None and len(velocity) >= basis.shape[-1] and flipped.any():
+                if scene == scene_id and velocity is not None and len(velocity) >= len(flipped):
                     signs = torch.ones_like(velocity)
                     signs[: len(flipped)][flipped.to(signs.device)] = -1
                     state_dict[f"{prefix}velocity.{sequence_id}"] = signs * velocity
@@ -195,10 +191,6 @@ class ModalInitialStates(InitialStates):
         """The motion o [scene units]."""
         basis, velocity = self._basis[self.scene_of_sequence[sequence_id]], self.velocity[sequence_id]
         return basis.to(velocity) @ velocity[: basis.shape[-1]]
-
-    def start(self, sequence_id: int) -> Float[Tensor, " 12"]:
-        """The last twelve numbers."""
-        return self.velocity[sequence_id][-START:]
 
     @torch.no_grad()
     def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:

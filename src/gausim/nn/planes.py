@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -52,16 +53,12 @@ class Planes(nn.Module):
 
     def forward(self, points: Float[Tensor, "P D"]) -> Float[Tensor, "P features"]:
         """Features of points in [-1, 1]^D."""
-        result: Tensor | None = None
+        found = []
         for (i, j), plane in zip(self.pairs, self.planes, strict=True):
             places = torch.stack((points[:, i], points[:, j]), -1)[None, None]
-            found = F.grid_sample(plane, places, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
-            if result is None:
-                result = found
-            else:
-                result = result * found if self.combine == PRODUCT else result + found
-        assert result is not None
-        return result
+            sampled = F.grid_sample(plane, places, mode="bilinear", padding_mode="border", align_corners=True)
+            found.append(sampled[0, :, 0].T)
+        return functools.reduce(torch.mul if self.combine == PRODUCT else torch.add, found)
 
     def variation(self) -> Float[Tensor, ""]:
         """Mean squared difference of neighbouring features along the spatial axes, summed over planes."""
@@ -74,8 +71,6 @@ class Planes(nn.Module):
 
     def unsteadiness(self) -> Float[Tensor, ""]:
         """Mean squared second difference of features in time, summed over planes with time; 0 without time."""
-        total = torch.zeros((), device=self.planes[0].device)
-        for (_, j), plane in zip(self.pairs, self.planes, strict=True):
-            if j == 3 and plane.shape[2] > 2:
-                total = total + plane.diff(n=2, dim=2).square().mean()
-        return total
+        with_time = [plane for (_, j), plane in zip(self.pairs, self.planes, strict=True) if j == 3]
+        none = torch.zeros((), device=self.planes[0].device)
+        return sum((plane.diff(n=2, dim=2).square().mean() for plane in with_time if plane.shape[2] > 2), none)

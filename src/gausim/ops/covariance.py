@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 
 def covariance_from_scales(log_scales: Float[Tensor, "*N 3"], quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:

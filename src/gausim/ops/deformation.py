@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 
 MAX_LOG_STRETCH = 5.0  # bound of the logarithmic stretch (METHOD section 2)
 POLAR_ITERATIONS = 8

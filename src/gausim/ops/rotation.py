@@ -1,10 +1,21 @@
-"""Rotations and the vectors that generate them."""
+"""Rotations, and the vectors and quaternions that describe them."""
 
 from __future__ import annotations
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+
+def quaternion_to_matrix(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
+    """Rotation matrices of quaternions w x y z of any non-zero length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
+        torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
+        torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
+    )
+    return torch.stack(rows, -2)
 
 
 def cross_matrix(vector: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3 3"]:
@@ -19,9 +30,14 @@ def rotation_of(vector: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3 3"]:
     return torch.linalg.matrix_exp(cross_matrix(vector))
 
 
+def axial(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+    """sum_k r_k x s_k for the matrix sum_k s_k r_k^T."""
+    lower = matrix - matrix.mT
+    return torch.stack((lower[2, 1], lower[0, 2], lower[1, 0]))
+
+
 def rotation_vector(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
     """Axis times angle [radian] of a rotation by less than pi."""
-    lower = rotation - rotation.mT
-    axis = torch.stack((lower[2, 1], lower[0, 2], lower[1, 0])) / 2
+    axis = axial(rotation) / 2
     angle = torch.atan2(axis.norm(), (rotation.trace() - 1) / 2)
     return axis * (angle / angle.sin()) if angle > 1e-6 else axis

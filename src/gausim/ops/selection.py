@@ -65,12 +65,8 @@ class HalfSpace(Selection):
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
         """True for the kernels on the selected side."""
         x = scene.means[:, self.axis]
-        selected = torch.ones_like(x, dtype=torch.bool)
-        if self.below is not None:
-            selected = selected & (x < self.below)
-        if self.above is not None:
-            selected = selected & (x > self.above)
-        return selected
+        below = torch.inf if self.below is None else self.below
+        return (x < below) & (x > (-torch.inf if self.above is None else self.above))
 
 
 @dataclass(frozen=True)

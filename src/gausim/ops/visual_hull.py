@@ -123,24 +123,14 @@ def _carve_box(
     spacing: float,
     vetoes: int,
 ) -> VoxelHull:
+    """The hull on a grid over the box from ``low`` to ``high``; at most ``vetoes`` masks are against its points."""
     axes = [torch.arange(float(low[i]), float(high[i]) + spacing / 2, spacing) for i in range(3)]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-    occupied = _inside_masks(points.reshape(-1, 3), masks, viewmats, Ks, vetoes)
-    return VoxelHull(occupied.reshape(points.shape[:3]), points[0, 0, 0], spacing)
-
-
-def _inside_masks(
-    points: Float[Tensor, "N 3"],
-    masks: Bool[Tensor, "V H W"],
-    viewmats: Float[Tensor, "V 4 4"],
-    Ks: Float[Tensor, "V 3 3"],
-    vetoes: int,
-) -> Bool[Tensor, " N"]:
-    height, width = masks.shape[1:]
-    alive, seen = torch.arange(points.shape[0]), torch.zeros(points.shape[0])
-    against = torch.zeros(points.shape[0], dtype=torch.int32)
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    points, (height, width) = grid.reshape(-1, 3), masks.shape[1:]
+    alive, seen = torch.arange(len(points)), torch.zeros(len(points))
+    against = torch.zeros(len(points), dtype=torch.int32)
     # View by view, each on the points left by earlier ones: ten times less work than all points in all views.
-    for view in range(masks.shape[0]):
+    for view in range(len(masks)):
         pixels, depth = project(points[alive], viewmats[view : view + 1], Ks[view : view + 1])
         x, y = pixels[0].floor().long().unbind(-1)  # the centre of pixel i is at i + 0.5
         visible = (depth[0] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -148,9 +138,9 @@ def _inside_masks(
         seen[alive[visible]] += 1
         against[alive[visible & ~covered]] += 1
         alive = alive[against[alive] <= vetoes]
-    inside = torch.zeros(points.shape[0], dtype=torch.bool)
-    inside[alive] = seen[alive] >= _MINIMUM_SEEN * masks.shape[0]
-    return inside
+    inside = torch.zeros(len(points), dtype=torch.bool)
+    inside[alive] = seen[alive] >= _MINIMUM_SEEN * len(masks)
+    return VoxelHull(inside.reshape(grid.shape[:3]), grid[0, 0, 0], spacing)
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int, *, start: int = 0) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gausim.core.scene import GaussianScene
 from gausim.ops.covariance import covariance_from_scales
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import C0, evaluate_sh
 
 # 3DGS divides a split kernel's scales by 1.6; along the axis of the split only, that keeps the covered area.

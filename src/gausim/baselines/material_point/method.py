@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Unpack
+from typing import Unpack, cast
 
 import torch
 from jaxtyping import Float
@@ -31,15 +31,15 @@ from gausim.baselines.mpm import (
     TimeStep,
     fill_interior,
 )
-from gausim.baselines.mpm.runtime import warp
+from gausim.baselines.mpm.substeps import warp
 from gausim.core import ConfigError, FittedState, GaussianScene
 from gausim.nn.mlp import mlp, zero_output
 from gausim.nn.planes import SUM, Planes
 from gausim.ops.covariance import covariance_from_scales
 
-# Range of Young's modulus in PhysDreamer [simulation units].
 # Coulomb's coefficient of a floor that states none.
 FRICTION = 0.5
+# Range of Young's modulus in PhysDreamer [simulation units].
 LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
 
 
@@ -132,15 +132,6 @@ class Domain:
         x, y, z = (self.size / 2 - scale * (low + high) / 2).tolist()
         return SceneMapping(scale, (x, y, z))
 
-    def interior(self, scene: GaussianScene) -> Float[Tensor, "M 3"] | None:
-        """Points that fill the interior of a scene [scene units]; None without filling."""
-        if self.settings.filling is None:
-            return None
-        mapping, body = self.mapping(scene), scene.select(scene.simulated)
-        means, opacities = mapping.to_simulation(body.means), torch.sigmoid(body.opacity_logits)
-        covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
-        return mapping.to_scene(fill_interior(means, covars, opacities, self.size, self.settings.filling))
-
 
 def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
     """Lower and upper corner of the bounding box of the simulated kernels [scene units]."""
@@ -212,9 +203,16 @@ class MaterialPoints(Fitted):
         raise NotImplementedError
 
     def interior(self, scene: GaussianScene) -> Float[Tensor, "M 3"] | None:
-        """Points that fill the interior of a scene, which are counted in :attr:`filled`; None without filling."""
-        found = self.domain.interior(scene)
-        self.filled.append(0 if found is None else len(found))
+        """Points that fill the interior of a scene, counted in :attr:`filled` [scene units]; None without filling."""
+        filling = self.domain.settings.filling
+        if filling is None:
+            self.filled.append(0)
+            return None
+        mapping, body = self.domain.mapping(scene), scene.select(scene.simulated)
+        means, opacities = mapping.to_simulation(body.means), torch.sigmoid(body.opacity_logits)
+        covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
+        found = mapping.to_scene(fill_interior(means, covars, opacities, self.domain.size, filling))
+        self.filled.append(len(found))
         return found
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
@@ -316,9 +314,7 @@ class MaterialPoints(Fitted):
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """``velocity_variation``: of the planes of the velocity field."""
-        field = self.velocity[sequence_id]
-        assert isinstance(field, TriPlaneField)
-        return {"velocity_variation": field.planes.variation()}
+        return {"velocity_variation": cast(TriPlaneField, self.velocity[sequence_id]).planes.variation()}
 
 
 def require_modulus(value: float) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Unpack
+from typing import Unpack, cast
 
 import torch
 from jaxtyping import Float
@@ -171,5 +171,4 @@ class PhysDreamer(MaterialPoints):
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """``velocity_variation`` and ``modulus_variation``: of the planes of the fields."""
         field = self.modulus_field[self.scene_of_sequence[sequence_id]]
-        assert isinstance(field, TriPlaneField)
-        return {**super().penalties(sequence_id), "modulus_variation": field.planes.variation()}
+        return {**super().penalties(sequence_id), "modulus_variation": cast(TriPlaneField, field).planes.variation()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,10 +38,6 @@ class ParticleState:
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(x, v, C, F)."""
         return self.positions, self.velocities, self.affine, self.deformation_gradients
-
-    def detach(self) -> ParticleState:
-        """The same state without history; loss gradients stop here."""
-        return ParticleState(*(getattr(self, f.name).detach() for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,9 @@
-"""Substeps and their adjoint as Warp launches on the caller's arrays."""
+"""Substeps and their adjoint as Warp launches on the caller's arrays; Warp is imported when they are first needed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -11,10 +12,36 @@ from torch import Tensor
 
 from gausim.baselines.mpm.config import Grid, Material, Slope
 from gausim.baselines.mpm.particles import Particles
-from gausim.baselines.mpm.runtime import warp
+from gausim.core import ConfigError
 from gausim.kernels.announce import announced
 
 MARGIN = 4  # cells that particles may move within a frame before a larger window is needed
+
+
+def warp() -> Any:
+    """The module ``warp``, initialised without its banner.
+
+    Raises:
+        ConfigError: Warp is not installed.
+    """
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise ConfigError(
+            "the material point method needs NVIDIA Warp, which is not installed: pip install 'gausim[baselines]'."
+        ) from error
+    if wp.config.log_level < wp.LOG_WARNING:
+        wp.config.log_level = wp.LOG_WARNING
+    wp.init()
+    return wp
+
+
+def on_stream_of(device: torch.device) -> AbstractContextManager[Any]:
+    """Runs a block on torch's stream of a CUDA device, so that the work of both libraries stays in order."""
+    wp = warp()
+    if device.type != "cuda":
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
 
 
 def views(tensors: Sequence[Tensor]) -> list[Any]:
@@ -56,12 +83,12 @@ class Substeps:
 
     def __init__(self, particles: Particles, material: Material, grid: Grid) -> None:
         wp = warp()
-        from gausim.baselines.mpm.device_code import transfer
+        from gausim.baselines.mpm import device_code
 
-        self._wp, self._kernels, self._grid, self._material = wp, transfer, grid, material
+        self._wp, self._kernels, self._grid, self._material = wp, device_code, grid, material
         self.device = wp.device_from_torch(particles.mass.device)
         with announced("the material point method", compiler="Warp"):
-            wp.load_module(transfer.__name__, device=self.device)
+            wp.load_module(device_code.__name__, device=self.device)
         self.count = len(particles.mass)
         # Warp's views do not own the memory of their tensors.
         held, pinned = particles.pinned.to(torch.uint8), particles.pinned_nodes.to(torch.uint8)

@@ -125,7 +125,8 @@ class _Move(torch.autograd.Function):
         like = x.detach().numpy().dtype
         xs, vs = (np.empty((substeps + 1, *x.shape), like) for _ in range(2))
         xs[0], vs[0] = x.detach().numpy(), v.detach().numpy()
-        springs = _arrays(net, stiffness, drag, like)
+        numbers = (n.detach().numpy().astype(like) for n in (net.length, stiffness, drag))
+        springs = net.starts.numpy(), net.second.numpy(), *numbers
         moving = free.detach().numpy().astype(like).reshape(-1)
         with announced("the springs"):
             _forward(xs, vs, *springs, moving, like.type(1 / substeps))
@@ -140,11 +141,6 @@ class _Move(torch.autograd.Function):
         by_stiffness, by_drag = (np.zeros(len(springs[2]), xs.dtype) for _ in range(2))
         _backward(xs, vs, *springs, moving, xs.dtype.type(1 / (len(xs) - 1)), gx, gv, by_stiffness, by_drag)
         return (*map(torch.from_numpy, (gx, gv, by_stiffness, by_drag)), None, None, None)
-
-
-def _arrays(net: Net, stiffness: Tensor, drag: Tensor, like: np.dtype) -> tuple[np.ndarray, ...]:
-    numbers = (net.length, stiffness, drag)
-    return (net.starts.numpy(), net.second.numpy(), *(n.detach().numpy().astype(like) for n in numbers))
 
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)

@@ -1,4 +1,4 @@
-"""Batches of sequences, of one or several scenes, as one disjoint graph."""
+"""Batches of sequences, of one or several scenes, as one disjoint graph, and the edges of its steps."""
 
 from __future__ import annotations
 
@@ -14,18 +14,15 @@ from torch import Tensor
 from gausim.core import GaussianScene
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.settings import HierarchySettings
-from gausim.ops.neighbours import radius_edges
-
-
-@dataclass(frozen=True, eq=False)
-class Inheritance:
-    """Assignment of kernels to the units of the finest predicted level whose motion they inherit."""
-
-    rest: Float[Tensor, "K 3"]  # rest positions of all kernels [scene units]
-    unit: Int[Tensor, " K"]  # the unit of each kernel, -1 for kernels that never move
-    # row of each unit among the `padded` rows of deformation gradients; the other rows are identities
-    rows: Int[Tensor, " N"]
-    padded: int  # number of rows, identities included
+from gausim.ops.neighbours import (
+    batched_radius_edges,
+    coded_edges,
+    combine_codes,
+    edge_codes,
+    neighbour_codes,
+    no_edge,
+    radius_edges,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +76,35 @@ class LevelBatch:
         return self.radii.to(self.pinned.device)
 
 
+def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
+    """Edges of a level whose units are at ``positions`` [scene units], sorted by destination, then source.
+
+    Args:
+        rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
+        level: the units.
+        positions: their current positions.
+    """
+    if rule == "rest":
+        return level.rest_edges
+    current = batched_radius_edges(positions, level.offsets, level.radii, level.max_neighbours)
+    if rule == "current":
+        return current
+    rest, now = (edge_codes(edges, level.count) for edges in (level.rest_edges, current))
+    combined = combine_codes(rest, now, level.count, rule=rule)
+    return coded_edges(combined[combined < no_edge(level.count)], level.count)
+
+
+def fixed_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
+    """The same edges, padded to the largest possible number by edges N -> N of a dummy node; not for rule ``rest``.
+
+    E does not depend on the positions, and the host is not synchronised.
+    """
+    codes = neighbour_codes(positions, level.member, level.device_radii, level.max_neighbours)
+    if rule != "current":
+        codes = combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule)
+    return coded_edges(codes, level.count)
+
+
 @dataclass(frozen=True, eq=False)
 class SceneBatch:
     """The disjoint union of the scenes of several sequences."""
@@ -92,7 +118,12 @@ class SceneBatch:
     dt: Float[Tensor, "M 1"]  # frame interval of each simulated kernel's sequence [s]
     # unit of the finest predicted level of every kernel; 0 for never-simulated kernels, whose mass fraction is 0
     finest: Int[Tensor, " K"]
-    kernels: Inheritance  # units whose motion the kernels inherit
+    # the unit of that level whose motion each kernel inherits, -1 for kernels that never move
+    inherited: Int[Tensor, " K"]
+    # row of each of these units among the `padded` rows of deformation gradients; the other rows, one after each
+    # member's units, are identities for its kernels that never move
+    rows: Int[Tensor, " N"]
+    padded: int  # number of rows, identities included
 
     @property
     def scene_ids(self) -> tuple[int, ...]:
@@ -147,25 +178,26 @@ class BatchBuilder:
             # A pinned kernel has the identity, unless a hand turns it.
             free = ~base[j].pinned if scene.hand is None else torch.ones_like(base[j].pinned)
             unit_of_kernel[hierarchy.kernels[free]] = hierarchy.ancestor(0, finest)[free]
-            spans = slice(*kernels[j : j + 2]), slice(*units[j : j + 2])
-            members.append(Member(scene_ids[j], *spans, unit_of_kernel.to(device), scene.surroundings.free))
+            own = slice(*kernels[j : j + 2]), slice(*units[j : j + 2])
+            members.append(Member(scene_ids[j], *own, unit_of_kernel.to(device), scene.surroundings.free))
         levels = tuple(self._level(p, scene_ids, device) for p in range(len(self.settings.predicted)))
-        rest, index = (
-            torch.cat([scene.means for scene in scenes]).to(device),
-            _joined([h.kernels for h in chosen], kernels, device),
-        )
+        index = _joined([h.kernels for h in chosen], kernels, device)
         pinned = torch.cat([b.pinned for b in base]).to(device)
-        unit = levels[-1].unit_of_kernel
+        unit, spans = levels[-1].unit_of_kernel, levels[-1].spans
+        still = torch.full((kernels[-1],), -1, device=device)
+        rows = torch.cat([torch.arange(span.start, span.stop) + i for i, span in enumerate(spans)]).to(device)
         return SceneBatch(
             members=tuple(members),
             levels=levels,
-            rest=rest,
+            rest=torch.cat([scene.means for scene in scenes]).to(device),
             simulated=index,
             pinned=pinned,
             volume=torch.cat([b.volume for b in base]).to(device),
             dt=self._spread([1.0 / self.fps[i] for i in scene_ids], [b.count for b in base]).to(device),
             finest=torch.zeros(kernels[-1], dtype=torch.int64, device=device).index_copy(0, index, unit),
-            kernels=_inheritance(rest, index, pinned, levels[-1]),
+            inherited=still.index_copy(0, index, torch.where(pinned, -1, unit)),
+            rows=rows,
+            padded=len(rows) + len(spans),
         )
 
     def _level(self, position: int, scene_ids: Sequence[int], device: torch.device) -> LevelBatch:
@@ -203,11 +235,3 @@ def _starts(counts: list[int]) -> list[int]:
 def _joined(parts: list[Tensor], starts: list[int], device: torch.device) -> Tensor:
     """Concatenation along the last axis of member indices, shifted to indices of the union."""
     return torch.cat([p + start for p, start in zip(parts, starts, strict=False)], -1).to(device)
-
-
-def _inheritance(rest: Tensor, simulated: Tensor, pinned: Tensor, finest: LevelBatch) -> Inheritance:
-    """Kernel inheritance: free kernels from their unit; an identity row after each member's units serves its pins."""
-    unit = torch.where(pinned, -1, finest.unit_of_kernel)
-    held = torch.full((len(rest),), -1, device=rest.device)
-    rows = torch.cat([torch.arange(span.start, span.stop) + i for i, span in enumerate(finest.spans)]).to(rest.device)
-    return Inheritance(rest, held.index_copy(0, simulated, unit), rows, len(rows) + len(finest.spans))

@@ -86,7 +86,8 @@ def build_hierarchy(
     pinned = scene.pinned.cpu()[index]
     # Kernels that move together: the free ones, and those of each hand.
     group = torch.where(pinned, 1, 0) if scene.hand is None else torch.where(pinned, scene.hand.cpu()[index] + 2, 0)
-    roots = pinned.nonzero()[:, 0].numpy() if pinned.any() else _most_central(rest)
+    central = (rest - rest.mean(0)).norm(dim=1).argmin()[None]  # the root of a body that nothing holds
+    roots = (pinned.nonzero()[:, 0] if pinned.any() else central).numpy()
     diagonal = scene.diagonal if axes is None else float(np.linalg.norm(np.ptp(rest.numpy() @ axes.T, axis=0)))
     tree = cKDTree(rest[roots].numpy())
     levels = []
@@ -101,11 +102,6 @@ def build_hierarchy(
             rest, volume, group = _coarsen(rest, volume, group, parent)
             pinned = group > 0
     return Hierarchy(tuple(levels), index, diagonal)
-
-
-def _most_central(rest: Tensor) -> np.ndarray:
-    """The kernel nearest to the mean, (1,)."""
-    return (rest - rest.mean(0)).norm(dim=1).argmin()[None].numpy()
 
 
 def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float, clustering: str) -> Tensor:

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gausim.models.hierarchy.batch import SceneBatch
-from gausim.ops.aggregation import weighted_sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +24,13 @@ class FixedUnits:
     attributes: Float[Tensor, "N A"]  # unweighted mean over the kernels
     # mass of the whole scene times its diagonal, the unit of momenta per step [mass scene units]
     scale: Float[Tensor, "N 1"]
+
+
+def weighted_sum(
+    values: Float[Tensor, "K C"], weights: Float[Tensor, " K"], index: Int[Tensor, " K"], count: int
+) -> Float[Tensor, "N C"]:
+    """Sum of w_k y_k over the members k of each of ``count`` units; ``index`` is the unit of every member."""
+    return values.new_zeros(count, values.shape[1]).index_add(0, index, values * weights[:, None])
 
 
 def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tensor, "N C"]) -> list[Tensor]:

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Floor, SimState
-from gausim.models.reference.placed import Placed, turned_units
+from gausim.models.reference.reference import Placed, turned_units
 from gausim.ops.deformation import apply
 from gausim.ops.rotation import cross_matrix, rotation_of
 

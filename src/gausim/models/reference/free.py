@@ -16,18 +16,11 @@ from torch import Tensor
 
 from gausim.core import SimState
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.placed import Placed, turned_units
-from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
+from gausim.models.reference.reference import Body, Carried, HandMotion, Placed, UnitMotion, turned_units
 from gausim.ops.deformation import polar_rotation
-from gausim.ops.rotation import rotation_of
+from gausim.ops.rotation import axial, rotation_of
 
 NEWTON_STEPS = 4
-
-
-def axial(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
-    """sum_k r_k x s_k for the matrix sum_k s_k r_k^T."""
-    lower = matrix - matrix.mT
-    return torch.stack((lower[2, 1], lower[0, 2], lower[1, 0]))
 
 
 class FreeBody(Body):
@@ -88,7 +81,7 @@ class FreeBody(Body):
         return FreeMotion(self, now, before, state)
 
 
-class FreeMotion(BodyMotion):
+class FreeMotion(Carried):
     """One step of a free body."""
 
     def __init__(self, body: FreeBody, now: Tensor, before: Tensor, state: SimState) -> None:
@@ -98,12 +91,10 @@ class FreeMotion(BodyMotion):
         acceleration = self.guess - 2 * self.turned + last
         offset = body.units - body.centre
         load = torch.cat((-(offset @ acceleration.mT) @ self.turned, offset.new_zeros(len(offset), 9)), 1)
-        self.relative = UnitMotion(
-            body.centre + about(now, self.centre) @ self.turned,
-            body.centre + about(before, self.last_centre) @ last,
-            load,
-            None if body.contact is None else body.contact.nearness(now, self.turned),
-        )
+        present = body.centre + about(now, self.centre) @ self.turned
+        past = body.centre + about(before, self.last_centre) @ last
+        floor = None if body.contact is None else body.contact.nearness(now, self.turned)
+        super().__init__(UnitMotion(present, past, load, floor))
 
     def place(self, made: Placed) -> Placed:
         """The predicted shape, placed so that momentum and angular momentum are kept; then the floor."""

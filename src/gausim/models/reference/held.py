@@ -22,8 +22,7 @@ from torch import Tensor
 from gausim.core import GaussianScene, HandPose, SimState
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.placed import Placed
-from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
+from gausim.models.reference.reference import Body, Carried, HandMotion, Placed, UnitMotion
 from gausim.models.template.solid import SolidSettings, static_responses
 from gausim.ops.deformation import apply, polar_rotation
 from gausim.ops.rotation import rotation_vector
@@ -106,14 +105,13 @@ class StaticShape:
 
 
 class HeldBody(Body):
-    """A member in hands."""
+    """A member in hands, which begins at rest: undeformed it is not turned."""
 
     def __init__(
         self,
         shape: StaticShape,
         kernels: Float[Tensor, "K 3"],
         rest: Float[Tensor, "N 3"],
-        unit_of_kernel: Int[Tensor, " K"],
         gravity: Float[Tensor, " 3"],
         contact: Contact | None,
         elasticity: Elasticity,
@@ -124,12 +122,11 @@ class HeldBody(Body):
             shape: the static shape of the scene.
             kernels: rest positions of all kernels [scene units].
             rest: those of the finest units, X.
-            unit_of_kernel: the unit of each kernel; N (the identity row) for those never simulated.
             gravity: [scene units / frame^2].
             contact: the floor; None: there is none.
             elasticity: how the body yields to a contact.
         """
-        self.shape, self.kernels, self.units, self.unit_of_kernel = shape, kernels, rest, unit_of_kernel
+        self.shape, self.kernels, self.units, self.unit_of_kernel = shape, kernels, rest, elasticity.unit_of_kernel
         self.gravity, self.contact, self.elasticity = gravity, contact, elasticity
         self.of = shape.of.to(kernels.device)
 
@@ -152,16 +149,12 @@ class HeldBody(Body):
         still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
         return torch.where(still[:, None], self.kernels, moved)
 
-    def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
-        """The identity: a body in hands begins at rest."""
-        return torch.eye(3).to(self.units)
-
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
         """The units relative to the static shape, and the load of its acceleration, gravity and slope in its axes."""
         return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))
 
 
-class HeldMotion(BodyMotion):
+class HeldMotion(Carried):
     """One step of a body in hands."""
 
     def __init__(self, body: HeldBody, now: Tensor, before: Tensor, state: SimState, hands: HandMotion) -> None:
@@ -173,9 +166,10 @@ class HeldMotion(BodyMotion):
         slope = torch.stack(slopes).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
         load = torch.cat((pull, slope.flatten(1)), 1)
         floor = None if body.contact is None else body.contact.nearness(now, present[1])
-        self.relative = UnitMotion(
-            body.units + (now - present[0]) @ present[1], body.units + (before - last[0]) @ last[1], load, floor
+        shown, shown_before = (
+            body.units + (x - place) @ axes for x, (place, axes, *_) in ((now, present), (before, last))
         )
+        super().__init__(UnitMotion(shown, shown_before, load, floor))
 
     def place(self, made: Placed) -> Placed:
         """The prediction about the static shape at t + 1; pinned kernels go where their hands are; then the floor."""

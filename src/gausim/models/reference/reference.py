@@ -14,8 +14,7 @@ prediction y, G, Q of the kernels at t + 1 goes back to
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,7 +24,6 @@ from torch import Tensor
 
 from gausim.core import HandPose, Hands, SimState
 from gausim.models.hierarchy.batch import Member, SceneBatch
-from gausim.models.reference.placed import Placed
 
 
 class HandMotion(NamedTuple):
@@ -53,31 +51,60 @@ class UnitMotion:
     floor: Float[Tensor, "N 4"] | None = None
 
 
-class BodyMotion(ABC):
-    """One step of a body whose reference moves."""
+class Placed(NamedTuple):
+    """Kernels and units of a body, in scene axes."""
 
-    relative: UnitMotion
+    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
+    deformation_gradients: Float[Tensor, "R 3 3"]  # of the units and the identity row
+    rotations: Float[Tensor, "R 3 3"]
+    # positions one frame earlier as the next step has to see them, where an impact changed the velocity
+    previous: Float[Tensor, "K 3"] | None = None
 
-    @abstractmethod
-    def place(self, made: Placed) -> Placed:
-        """The prediction relative to the reference, in the scene."""
+
+def turned_units(rotation: Float[Tensor, "3 3"], matrices: Float[Tensor, "R 3 3"]) -> Float[Tensor, "R 3 3"]:
+    """Matrices of the units after a rotation of the body; the identity row, the last, stays."""
+    return torch.cat((rotation @ matrices[:-1], matrices[-1:]))
 
 
 class Carried:
-    """A step relative to a reference at rest: positions are those in the scene."""
+    """A step relative to a reference; in this base class to one at rest, where positions are those in the scene."""
 
-    def __init__(self, now: Float[Tensor, "N 3"], before: Float[Tensor, "N 3"]) -> None:
-        self.relative = UnitMotion(now, before, None)
+    def __init__(self, relative: UnitMotion) -> None:
+        self.relative = relative
 
     def place(self, made: Placed) -> Placed:
-        """The prediction in the scene."""
+        """The prediction relative to the reference, in the scene."""
         return made
 
 
-class Reference(ABC):
-    """The reference of a batch."""
+class Body:
+    """A member of a batch, constant between two updates of the parameters; in this base class its reference is at rest.
 
-    @abstractmethod
+    States are those of its kernels (K, 3), in scene axes.
+    """
+
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> Carried:
+        """A step of the body from its units (N, 3) and kernels at t and t - 1."""
+        return Carried(UnitMotion(now, before, now.new_zeros(len(now), 12)))
+
+    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
+        """A state relative to the reference."""
+        return state
+
+    def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
+        """Rotation of the undeformed body in a state."""
+        return torch.eye(3).to(state.positions)
+
+
+class Reference:
+    """The reference of a batch; in this base class nothing moves as a whole."""
+
+    moves = False
+
+    def __init__(self, batch: SceneBatch) -> None:
+        """Stores the members and the rows of their units."""
+        self._members, self._spans, self._like = batch.members, batch.levels[-1].spans, batch.rest
+
     def carry(
         self,
         now: Float[Tensor, "N 3"],
@@ -89,63 +116,36 @@ class Reference(ABC):
 
         ``now`` and ``before`` are in scene axes; ``hands`` are those of every member.
         """
+        return Carried(UnitMotion(now, before, None))
 
-    @abstractmethod
     def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
         """Deformation gradients and rotations of all rows of a step where the bodies have their rest shape."""
+        identity = torch.eye(3).to(self._like).expand(self._members[-1].units.stop, 3, 3)
+        return identity, identity
 
     def turned(self, state: SimState) -> Float[Tensor, "N 3 3"] | None:
         """Rotation of the undeformed body of every finest unit in a state of the kernels; None where nothing moves."""
         return None
 
-    @abstractmethod
     def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
         """A state of the kernels relative to the reference."""
-
-
-class StillReference(Reference):
-    """The reference of a batch in which nothing moves as a whole."""
-
-    def __init__(self, batch: SceneBatch) -> None:
-        """Stores the number of rows."""
-        self._rows, self._like = batch.members[-1].units.stop, batch.rest
-
-    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
-        """The units' positions as they are."""
-        return Carried(now, before)
-
-    def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
-        """Identities."""
-        identity = torch.eye(3).to(self._like).expand(self._rows, 3, 3)
-        return identity, identity
-
-    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
-        """The state as it is."""
         return state
-
-
-class Body(ABC):
-    """A member of a batch whose reference moves; constant between two updates of the parameters."""
-
-    @abstractmethod
-    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> BodyMotion:
-        """A step of the body from its units (N, 3) and kernels (K, 3) at t and t - 1, in scene axes."""
-
-    @abstractmethod
-    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
-        """A state of the body's kernels relative to the reference."""
-
-    @abstractmethod
-    def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
-        """Rotation of the undeformed body in a state of its kernels."""
 
 
 class MovingReference(Reference):
     """The references of a batch, member by member."""
 
-    def __init__(self, batch: SceneBatch, bodies: Sequence[Body | None]) -> None:
-        """``bodies`` has one entry per member; None: its reference is at rest."""
-        self._members, self._spans, self._bodies = batch.members, batch.levels[-1].spans, bodies
+    moves = True
+
+    def __init__(self, batch: SceneBatch, bodies: Sequence[Body]) -> None:
+        """``bodies`` has one entry per member."""
+        super().__init__(batch)
+        self._bodies = bodies
+
+    def _own(self, state: SimState) -> Iterator[SimState]:
+        """The states of the members' kernels, in turn."""
+        for member in self._members:
+            yield SimState(state.positions[member.kernels], state.previous[member.kernels])
 
     def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
         """Rotations of the bodies; identities for kernels that never move."""
@@ -155,59 +155,40 @@ class MovingReference(Reference):
 
     def turned(self, state: SimState) -> Float[Tensor, "N 3 3"]:
         """Rotation of the undeformed body of every finest unit in a state of the kernels."""
-        parts = []
-        for member, span, body in zip(self._members, self._spans, self._bodies, strict=True):
-            rotation = torch.eye(3).to(state.positions)
-            if body is not None:
-                rotation = body.turned(SimState(state.positions[member.kernels], state.previous[member.kernels]))
-            parts.append(rotation.expand(span.stop - span.start, 3, 3))
-        return torch.cat(parts)
+        members = zip(self._bodies, self._own(state), self._spans, strict=True)
+        return torch.cat([body.turned(own).expand(span.stop - span.start, 3, 3) for body, own, span in members])
 
     def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
         """A state of the kernels relative to the references."""
-        parts = []
-        for i, (member, body) in enumerate(zip(self._members, self._bodies, strict=True)):
-            own = SimState(state.positions[member.kernels], state.previous[member.kernels])
-            parts.append(own if body is None else body.isolated(own, None if hands is None else hands[i]))
+        hands = hands or [None] * len(self._bodies)
+        members = zip(self._bodies, self._own(state), hands, strict=True)
+        parts = [body.isolated(own, held) for body, own, held in members]
         return SimState(torch.cat([p.positions for p in parts]), torch.cat([p.previous for p in parts]))
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
         """The finest units' positions relative to the references, and the way back."""
-        motions: list[BodyMotion | None] = []
-        parts: list[UnitMotion] = []
-        for i, (member, span, body) in enumerate(zip(self._members, self._spans, self._bodies, strict=True)):
-            if body is None:
-                motions.append(None)
-                parts.append(UnitMotion(now[span], before[span], now.new_zeros(len(now[span]), 12)))
-                continue
-            own = SimState(state.positions[member.kernels], state.previous[member.kernels])
-            motions.append(body.carry(now[span], before[span], own, None if hands is None else hands[i]))
-            parts.append(motions[-1].relative)  # type: ignore[union-attr]
-        return _CarriedBodies(self._members, motions, parts, state)
+        hands = hands or [None] * len(self._bodies)
+        members = zip(self._bodies, self._spans, self._own(state), hands, strict=True)
+        motions = [body.carry(now[span], before[span], own, held) for body, span, own, held in members]
+        return _CarriedBodies(self._members, motions, state)
 
 
 class _CarriedBodies(Carried):
-    def __init__(
-        self,
-        members: Sequence[Member],
-        motions: Sequence[BodyMotion | None],
-        parts: Sequence[UnitMotion],
-        state: SimState,
-    ) -> None:
+    def __init__(self, members: Sequence[Member], motions: Sequence[Carried], state: SimState) -> None:
         self._members, self._motions, self._state = members, motions, state
+        parts = [motion.relative for motion in motions]
         load = torch.cat([part.load for part in parts if part.load is not None])
         floor = None
         if any(part.floor is not None for part in parts):
             floor = torch.cat([p.now.new_zeros(len(p.now), 4) if p.floor is None else p.floor for p in parts])
         now, before = torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts])
-        self.relative = UnitMotion(now, before, load, floor)
+        super().__init__(UnitMotion(now, before, load, floor))
 
     def place(self, made: Placed) -> Placed:
         placed = []
         for member, motion in zip(self._members, self._motions, strict=True):
             rows = made.deformation_gradients[member.units], made.rotations[member.units]
-            own = Placed(made.positions[member.kernels], *rows)
-            placed.append(own if motion is None else motion.place(own))
+            placed.append(motion.place(Placed(made.positions[member.kernels], *rows)))
         positions = torch.cat([own.positions for own in placed])
         deformation = torch.cat([own.deformation_gradients for own in placed])
         rotations = torch.cat([own.rotations for own in placed])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cached_property
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.reference.floor import Contact, Elasticity
 from gausim.models.reference.free import FreeBody
 from gausim.models.reference.held import HeldBody, StaticShape
-from gausim.models.reference.reference import Body, MovingReference, Reference, StillReference
+from gausim.models.reference.reference import Body, MovingReference, Reference
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import PreparedTemplate
 
@@ -63,18 +63,13 @@ class SceneSurroundings(nn.Module):
         floor = self.facts.floor
         if floor is None:
             return None
-        friction = like.new_tensor(floor.friction) if floor.friction is not None else None
-        restitution = like.new_tensor(floor.restitution) if floor.restitution is not None else None
-        if self.friction is not None:
-            friction = nn.functional.softplus(self.friction)
-        if self.restitution is not None:
-            restitution = torch.sigmoid(self.restitution)
-        assert friction is not None and restitution is not None
-        return Contact(floor, friction, restitution, self.diagonal)
+        friction = like.new_tensor(floor.friction) if self.friction is None else nn.functional.softplus(self.friction)
+        bounce = like.new_tensor(floor.restitution) if self.restitution is None else torch.sigmoid(self.restitution)
+        return Contact(floor, friction, bounce, self.diagonal)
 
 
 def reference_of(
-    surroundings: Sequence[SceneSurroundings],
+    surroundings: nn.ModuleList,
     batch: SceneBatch,
     mass: Float[Tensor, " M"],
     units: FixedUnits,
@@ -86,7 +81,7 @@ def reference_of(
     """The reference of a batch.
 
     Args:
-        surroundings: of every scene.
+        surroundings: :class:`SceneSurroundings` of every scene.
         batch: the sequences.
         mass: masses of the simulated kernels.
         units: constants of the finest predicted level, in scene axes.
@@ -94,34 +89,27 @@ def reference_of(
         axes: axes of the template's modes, as rows, per unit; None: scene axes.
         driven: let the pins of every scene move; those without recorded hands are one hand.
     """
-    if not driven and not any(surroundings[i].moves for i in batch.scene_ids):
-        return StillReference(batch)
+    known = [cast(SceneSurroundings, surroundings[i]) for i in batch.scene_ids]
+    if not driven and not any(own.moves for own in known):
+        return Reference(batch)
     masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
-    bodies: list[Body | None] = []
-    for number, (member, span) in enumerate(zip(batch.members, batch.levels[-1].spans, strict=True)):
-        own = surroundings[member.scene_id]
+    bodies: list[Body] = []
+    for number, (member, span, own) in enumerate(zip(batch.members, batch.levels[-1].spans, known, strict=True)):
         if not (driven or own.moves):
-            bodies.append(None)
+            bodies.append(Body())
             continue
         rest, kernels = units.rest[span], batch.rest[member.kernels]
         contact, gravity = own.contact(rest), own.acceleration(float(batch.levels[-1].dt[span.start]), rest)
-        yielding = _elasticity(template, number, None if axes is None else axes[span])
+        modes, slopes, matrices, whole = template.yielding(number)
+        if axes is not None:  # to scene axes
+            turn = axes[span]
+            modes, slopes = turn.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", turn, slopes, turn)
         unit = member.unit_of_kernel
         offset = kernels - torch.cat((rest, rest.new_zeros(1, 3)))[unit]
         fraction = masses[member.kernels] / masses[member.kernels].sum()
-        elasticity = Elasticity(unit, offset, *yielding, fraction, own.facts.free)
+        elasticity = Elasticity(unit, offset, modes, slopes, matrices, whole, fraction, own.facts.free)
         if own.shape is None:
             bodies.append(FreeBody(kernels, rest, masses[member.kernels], gravity, contact, elasticity))
         else:
-            bodies.append(HeldBody(own.shape, kernels, rest, unit, gravity, contact, elasticity))
+            bodies.append(HeldBody(own.shape, kernels, rest, gravity, contact, elasticity))
     return MovingReference(batch, bodies)
-
-
-def _elasticity(
-    template: PreparedTemplate, member: int, axes: Tensor | None
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Modes and slopes in scene axes, matrices and mass."""
-    modes, slopes, matrices, mass = template.yielding(member)
-    if axes is None:
-        return modes, slopes, matrices, mass
-    return axes.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", axes, slopes, axes), matrices, mass

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import DivergenceError, Forces, Hands, SimState, SteppedFrame, Trajectory, roll_out
-from gausim.models.reference.reference import StillReference, hand_motion
+from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.cuda_graph import GraphedStep
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
@@ -102,22 +102,21 @@ class SceneStepper:
         """
         batch = model.batch((scene_id,))
         member, prepared = batch.members[0], model.prepare(batch, driven=hands is not None)
+        moves = prepared.reference.moves
         self._model, self._name = model, model.scenes[scene_id].name
         self.fps: float = model.fps[scene_id]
         self._hands, self._number = hands, 0
         self.state, self.frame = initial, SteppedFrame(initial.positions, *prepared.reference.undeformed(initial))
         self.unit_of_kernel: Int[Tensor, " K"] = member.unit_of_kernel
 
-        still = isinstance(prepared.reference, StillReference)
-
         def step(state: SimState, force: Tensor | None) -> SteppedFrame:
             return model.step(batch, state, force, prepared, hands=[hand_motion(self._hands, self._number)])
 
-        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and still
+        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves
         self._step = GraphedStep(step, batch.rest) if graphed else step
         self._guard: EnergyGuard | None = None
         # Gravity, impacts and hands change the energy of a body that is not in fixed pins.
-        if model.rollout.energy_guard_frames and model.knows_energy and still:
+        if model.rollout.energy_guard_frames and model.knows_energy and not moves:
             self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
         # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)

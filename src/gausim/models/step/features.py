@@ -122,6 +122,8 @@ def network_inputs(
 ) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
     """Node and edge features of the units of one level, from their graph and their solved parents.
 
+    Nodes have the inertial acceleration of the parent's frame plus gravity and the local velocity, and with
+    ``rest_inputs`` the displacement and the velocity to the coarse prediction; or what ``velocities=False`` stands for.
     ``target`` are the units' template positions, ``size`` the diagonals of their scenes [scene units]; ``coarse``
     selects positions of the coarse prediction instead of the current ones.
     """
@@ -132,27 +134,19 @@ def network_inputs(
     parent = UnitState(*(parents / size).unbind())
     edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
     if options.velocities:
-        moving = _velocities(own, parent, dt, gravity / size, options, coarse=coarse)
+        inertial = gravity / size - (parent.after - 2 * parent.now + parent.before) / dt**2
+        local = own.after - parent.after if coarse else own.now - parent.now
+        columns = [inertial, (local - (own.before - parent.before)) / dt]
+        if options.rest_inputs:
+            columns += [own.now - own.rest, (own.after - own.now) / dt]
     else:
         lever = (unit.rest - above.rest.index_select(0, above.index)) / size
-        moving = [lever, own.now - own.rest, (coarsely - target) / size]
-    columns = [*moving, unit.log_density[:, None], unit.attributes]
+        columns = [lever, own.now - own.rest, (coarsely - target) / size]
+    columns += [unit.log_density[:, None], unit.attributes]
     if options.floor:
         near = unit.floor
         columns.append(unit.rest.new_zeros(len(unit.rest), FLOOR_FEATURES) if near is None else near)
     return torch.cat(columns, -1), edges
-
-
-def _velocities(
-    unit: UnitState, parent: UnitState, dt: Tensor, gravity: Tensor, options: FeatureOptions, *, coarse: bool
-) -> list[Tensor]:
-    """Inertial acceleration of the parent's frame plus gravity, local velocity, and ``rest_inputs``."""
-    inertial = gravity - (parent.after - 2 * parent.now + parent.before) / dt**2
-    local = unit.after - parent.after if coarse else unit.now - parent.now
-    columns = [inertial, (local - (unit.before - parent.before)) / dt]
-    if options.rest_inputs:
-        columns += [unit.now - unit.rest, (unit.after - unit.now) / dt]
-    return columns
 
 
 def edge_features(

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.models.hierarchy.batch import LevelBatch
-from gausim.models.hierarchy.edges import exact_edges, fixed_edges
+from gausim.models.hierarchy.batch import LevelBatch, exact_edges, fixed_edges
 from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, network_inputs
 from gausim.models.step.head import Head
 from gausim.models.step.recursion import Solved, Units

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from gausim.core import SimState
 from gausim.models.hierarchy.batch import SceneBatch
-from gausim.models.hierarchy.units import FixedUnits, per_level
+from gausim.models.hierarchy.units import FixedUnits, per_level, weighted_sum
 from gausim.models.reference.reference import Carried, HandMotion, Reference, UnitMotion
 from gausim.models.step.body_frame import Frames
 from gausim.models.step.recursion import Solved
 from gausim.models.template.template import PreparedTemplate
-from gausim.ops.aggregation import weighted_sum
 from gausim.ops.deformation import apply
 
 

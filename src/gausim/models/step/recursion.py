@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.models.hierarchy.batch import Inheritance
+from gausim.models.hierarchy.batch import SceneBatch
 from gausim.ops.deformation import apply, polar_rotation
 
 
@@ -73,7 +73,7 @@ def advance(
 
 
 def inherit(
-    finest: Solved, template: Float[Tensor, "N 3 3"] | None, kernels: Inheritance
+    finest: Solved, template: Float[Tensor, "N 3 3"] | None, batch: SceneBatch
 ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
     """Positions x_c + G_c (X_k - X_c) of all kernels, G and Q of the units and identity rows.
 
@@ -81,16 +81,16 @@ def inherit(
         finest: the finest predicted level, solved.
         template: deformation gradients P of the template, G = C P; None for the identity. Their rotations are detached
             from the loss gradient, as they only rotate colours.
-        kernels: the unit of every kernel.
+        batch: what every kernel inherits.
     """
     deformation_gradient, rotation = finest.deformation_gradient, finest.rotation
     if template is not None:
         deformation_gradient = deformation_gradient @ template
         rotation = rotation @ polar_rotation(template.detach())
-    unit = kernels.unit.clamp_min(0)
-    offset = kernels.rest - finest.rest.index_select(0, unit)
+    unit = batch.inherited.clamp_min(0)
+    offset = batch.rest - finest.rest.index_select(0, unit)
     moved = finest.after.index_select(0, unit) + apply(deformation_gradient.index_select(0, unit), offset)
-    positions = torch.where((kernels.unit < 0)[:, None], kernels.rest, moved)
-    identity = torch.eye(3, dtype=moved.dtype, device=moved.device).expand(kernels.padded, 3, 3)
-    rows = kernels.rows
+    positions = torch.where((batch.inherited < 0)[:, None], batch.rest, moved)
+    identity = torch.eye(3, dtype=moved.dtype, device=moved.device).expand(batch.padded, 3, 3)
+    rows = batch.rows
     return positions, identity.index_copy(0, rows, deformation_gradient), identity.index_copy(0, rows, rotation)

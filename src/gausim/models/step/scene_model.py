@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -15,17 +14,15 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import FixedUnits, fixed_units
-from gausim.models.reference.reference import Reference
-from gausim.models.reference.surroundings import SceneSurroundings, reference_of
+from gausim.models.hierarchy.units import fixed_units
+from gausim.models.reference.surroundings import SceneSurroundings
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
 from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.modal import ModalScene
-from gausim.models.template.smooth import smooth_motions
 from gausim.models.template.solid import SolidSettings
-from gausim.models.template.template import Motion, PreparedScenes, PreparedTemplate, Property, Template
+from gausim.models.template.template import Motion, PreparedScenes, Property, Template
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -97,22 +94,6 @@ class SceneModel(nn.Module, ABC):
                 self._batches.pop(next(iter(self._batches)))
             self._batches[key] = self._builder.build(key[0], device)
         return self._batches[key]
-
-    def reference(
-        self,
-        batch: SceneBatch,
-        mass: Float[Tensor, " M"],
-        units: FixedUnits,
-        rest: Float[Tensor, "N 3"],
-        template: PreparedTemplate,
-        frames: Frames | None,
-        *,
-        driven: bool,
-    ) -> Reference:
-        """The reference of a batch; ``rest`` are the finest units' centres in scene axes."""
-        own = [cast(SceneSurroundings, s) for s in self.surroundings]
-        axes = None if frames is None else frames.axes[-1]
-        return reference_of(own, batch, mass, replace(units, rest=rest), template, axes, driven=driven)
 
     def shape_bodies(self, solid: SolidSettings) -> None:
         """Says of which solids the static shapes of bodies in hands are."""
@@ -196,16 +177,25 @@ class SceneModel(nn.Module, ABC):
         return self.template.mixing(scene_id)
 
     def smooth_motions(self, scene_id: int) -> SmoothMotions | None:
-        """The template's modes at every kernel of a scene; None for templates without modes."""
+        """The template's modes at every kernel of a scene; None for templates without modes.
+
+        A kernel moves by the displacement of its unit plus the unit's displacement gradient times its offset.
+        """
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
-        modes, slopes, sizes = (x.to(self.scenes[scene_id].means) for x in motions)  # where the scenes are
+        scene, hierarchy, finest = self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1]
+        modes, slopes, sizes = (x.to(scene.means) for x in motions)  # where the scenes are
         axes = self.axes[scene_id].to(modes)
         modes = torch.einsum("ba,nbm->nam", axes, modes)
         slopes = torch.einsum("ca,ncdm,db->nabm", axes, slopes, axes)
-        own = modes, slopes, sizes
-        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
+        unit = hierarchy.ancestor(0, finest)
+        offset = scene.means[hierarchy.kernels] - hierarchy.levels[finest].rest[unit]
+        moved = modes[unit] + torch.einsum("kabm,kb->kam", slopes[unit], offset)
+        kernels = moved.new_zeros(scene.count, 3, modes.shape[-1])
+        kernels[hierarchy.kernels] = moved * ~hierarchy.levels[0].pinned[:, None, None]
+        rows, still = torch.cat((slopes, torch.zeros_like(slopes[:1]))), torch.full((scene.count,), len(modes))
+        return SmoothMotions(kernels, rows, still.index_copy(0, hierarchy.kernels, unit), sizes)
 
     @torch.no_grad()
     def material(self, scene_id: int) -> dict[str, Property]:

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
-from gausim.models.hierarchy.units import FixedUnits, fixed_units
-from gausim.models.reference.placed import Placed
-from gausim.models.reference.reference import HandMotion, StillReference, UnitMotion
+from gausim.models.hierarchy.units import FixedUnits, fixed_units, weighted_sum
+from gausim.models.reference.reference import HandMotion, Placed, Reference, UnitMotion
+from gausim.models.reference.surroundings import reference_of
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
@@ -24,7 +24,6 @@ from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Motion, RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
-from gausim.ops.aggregation import weighted_sum
 
 DEFAULT_HIERARCHY, DEFAULT_FEATURES = HierarchySettings(), FeatureOptions()
 PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
@@ -111,11 +110,11 @@ class GausSim(SceneModel):
             levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
             roots = frames.into(0, roots)
         template = self.template.prepare(batch, levels[-1])
-        reference = (
-            StillReference(batch)
-            if isolated
-            else self.reference(batch, mass, levels[-1], rest, template, frames, driven=driven)
-        )
+        reference = Reference(batch)
+        if not isolated:
+            axes = None if frames is None else frames.axes[-1]
+            units = replace(levels[-1], rest=rest)  # in scene axes
+            reference = reference_of(self.surroundings, batch, mass, units, template, axes, driven=driven)
         prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, reference)
         return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
 
@@ -145,7 +144,7 @@ class GausSim(SceneModel):
         carried, units = prepared.carried(state, hands)
         finest, template, momentum, predicted = self._descend(prepared, units, correction_scale, [])
         finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
-        x, deformation, rotations, before = carried.place(Placed(*inherit(finest, template, batch.kernels)))
+        x, deformation, rotations, before = carried.place(Placed(*inherit(finest, template, batch)))
         after = None if before is None else SimState(x, before)
         return Step(x, deformation, rotations, momentum, tuple(predicted), after)
 

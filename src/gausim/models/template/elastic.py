@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -202,9 +202,7 @@ class ElasticTemplate(Template):
 
     def scene(self, scene_id: int) -> ElasticScene:
         """Modes and matrices of one scene."""
-        scene = self.scenes[scene_id]
-        assert isinstance(scene, ElasticScene)
-        return scene
+        return cast(ElasticScene, self.scenes[scene_id])
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """What a scene's matrices tell about its units."""

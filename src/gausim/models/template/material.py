@@ -37,6 +37,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 import torch
@@ -153,9 +154,7 @@ class MaterialTemplate(Template):
 
     def body(self, scene_id: int) -> BodyModes:
         """Modes of one scene."""
-        body = self.bodies[scene_id]
-        assert isinstance(body, BodyModes)
-        return body
+        return cast(BodyModes, self.bodies[scene_id])
 
     def decode(
         self, body: BodyModes, attributes: Float[Tensor, "N A"]

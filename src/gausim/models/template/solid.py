@@ -166,20 +166,17 @@ def solid_body(
     rigid = None if held.any() else grid.rigid_coefficients()[used]
     whole, carry = whole[used][:, used], sp.diags(root) @ carry
     solve = _solver(whole)
+
+    def made(eigenvalues: np.ndarray, vectors: np.ndarray, vibrations: int) -> SolidBody:
+        field = np.zeros((3 * grid.size, vectors.shape[1]))
+        field[used] = vectors
+        return SolidBody(grid, eigenvalues, field.reshape(3, grid.size, -1), body.centres, body.weights, vibrations)
+
     eigenvalues, vectors = lowest(solve, carry, modes, rigid)
-    vibrations = len(eigenvalues)
-    if curved:
-        found = SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
-        bent = derivatives(found, curved, solve, used, carry, rigid)
-        eigenvalues, vectors, vibrations = _joined(vectors, bent, whole, carry)
-    return SolidBody(grid, eigenvalues, _full(vectors, used, grid), body.centres, body.weights, vibrations)
-
-
-def _full(vectors: np.ndarray, used: np.ndarray, grid: Grid) -> np.ndarray:
-    """Coefficients (3, nodes, M) of vectors on the used nodes."""
-    full = np.zeros((3 * grid.size, vectors.shape[1]))
-    full[used] = vectors
-    return full.reshape(3, grid.size, -1)
+    found = made(eigenvalues, vectors, len(eigenvalues))
+    if not curved:
+        return found
+    return made(*_joined(vectors, derivatives(found, curved, solve, used, carry, rigid), whole, carry))
 
 
 def derivatives(
@@ -323,10 +320,7 @@ def lowest(
     carry k^-1 carry^T is solved instead: its largest eigenvalues are the inverses. Vectors are orthogonal to ``rigid``
     motions (D, 6), if there are any: loads are freed of them beforehand, displacements afterwards (inertia relief).
     """
-    rank = carry.shape[0]
-    count = min(count, rank)
-    turned = carry.T.tocsc()
-
+    rank, turned = carry.shape[0], carry.T.tocsc()
     whole = np.zeros((rank, 0)) if rigid is None else np.linalg.qr(carry @ rigid)[0]
     count = min(count, rank - whole.shape[1])
 

@@ -170,18 +170,22 @@ class PreparedScenes(PreparedTemplate):
         self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
 
     def _displacements(self, motion: Motion, rows: Tensor, members: list[int]) -> tuple[Tensor, Tensor]:
-        alone = len(self.parts) == 1
+        rest = motion.rest
         now, before = (
-            (x - motion.rest if alone else x.index_select(0, rows) - motion.rest.index_select(0, rows))
-            for x in (motion.now, motion.before)
+            self._own(x, rows, members) - self._own(rest, rows, members) for x in (motion.now, motion.before)
         )
-        return now.view(len(members), -1, 3), before.view(len(members), -1, 3)
+        return now, before
+
+    def _own(self, values: Tensor, rows: Tensor, members: list[int]) -> Tensor:
+        """Values (S, N, C) of one scene's members from those of all units (N, C)."""
+        own = values if len(self.parts) == 1 else values.index_select(0, rows)
+        return own.view(len(members), -1, values.shape[1])
 
     def __call__(self, motion: Motion, load: Float[Tensor, "N 12"] | None = None) -> TemplateState:
         """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
         made = []
         for part, rows, members in self.parts:
-            own = None if load is None else load.index_select(0, rows).view(len(members), -1, 12)
+            own = None if load is None else self._own(load, rows, members)
             made.append(part(*self._displacements(motion, rows, members), own).flatten(0, 1))
         moved = self._in_order(made)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
@@ -206,11 +210,8 @@ class PreparedScenes(PreparedTemplate):
 
     def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The part of a displacement by an impulse that its frame does not reach, scene by scene."""
-        made = []
-        for part, rows, members in self.parts:
-            own = displacement.index_select(0, rows).view(len(members), -1, 3)
-            made.append(part.withheld(own).flatten(0, 1))
-        return self._in_order(made)
+        parts = [part.withheld(self._own(displacement, rows, members)) for part, rows, members in self.parts]
+        return self._in_order([made.flatten(0, 1) for made in parts])
 
     def _in_order(self, made: list[Tensor]) -> Tensor:
         """Values of the units, scene by scene, in the order of the batch."""

@@ -31,8 +31,7 @@ from gausim.core import ConfigError, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
-from gausim.models.reference.placed import Placed
-from gausim.models.reference.reference import Carried
+from gausim.models.reference.reference import Carried, Placed
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
 from gausim.training.supervision.comparison import channels

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.rotation import quaternion_to_matrix, rotation_of, rotation_vector
 
 
 def _product(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
@@ -28,3 +28,9 @@ def test_rotations_of_any_length_compose_as_quaternions_do() -> None:
     assert torch.allclose(torch.linalg.det(a), torch.ones(40, dtype=torch.float64))
     assert torch.allclose(quaternion_to_matrix(_product(p, q)), a @ b, atol=1e-12)
     assert torch.allclose(quaternion_to_matrix(-7.5 * p), a, atol=1e-12)
+
+
+def test_the_vector_of_a_rotation() -> None:
+    vector = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
+    torch.testing.assert_close(rotation_vector(rotation_of(vector)), vector)
+    torch.testing.assert_close(rotation_vector(torch.eye(3).double()), torch.zeros(3).double())
