@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any
 
-from gausim.cli.bars import bars as plain_bars
+from gausim.cli.output import bars as plain_bars
 
 # Columns of a bar: step, number done, total.
 Tick = Callable[[str, int, int], None]

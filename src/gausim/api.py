@@ -18,7 +18,7 @@ import torch
 from gausim.compose.build import load_run
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import run_objects
-from gausim.core import Cameras, Renderer, SteppedFrame, Trajectory
+from gausim.core import Cameras, DataError, Renderer, SteppedFrame, Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
@@ -138,8 +138,6 @@ class Simulation:
             return orbit_cameras(scene.means[scene.foreground], azimuths=[float(camera)], size=size)
         names = self.cameras.names
         if camera is not None and camera not in names:
-            from gausim.core import DataError
-
             raise DataError(f"view '{camera}': expected one of {list(names)}, an azimuth [degree] or a camera.")
         return self.cameras.select([0 if camera is None else names.index(camera)])
 

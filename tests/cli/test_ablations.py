@@ -27,13 +27,13 @@ TINY = (
 )  # fmt: skip
 
 
-def fresh(toy: Path, ablation: str, model: str) -> tuple[GausSimModule, list[SequenceSample]]:
+def fresh(toy: Path, ablation: str, model: str, *more: str) -> tuple[GausSimModule, list[SequenceSample]]:
     """An untrained module and a batch for it."""
     torch.manual_seed(0)
     tiny = [x for x in TINY if x != LEVELS or "no_hierarchy" not in ablation]  # what is given by hand wins
-    module, datamodule = build(compose("train", [f"data.root={toy}", *tiny, f"model={model}", f"ablation={ablation}"]))
-    dataset = datamodule.index
-    return module, [dataset[SampleKey(i, 3)] for i in range(2)]
+    asked = [f"data.root={toy}", *tiny, f"model={model}", f"ablation={ablation}", *more]
+    module, datamodule = build(compose("train", asked))
+    return module, [datamodule.index[SampleKey(i, 3)] for i in range(2)]
 
 
 def train(module: GausSimModule, samples: list[SequenceSample], steps: int) -> list[dict[str, float]]:
@@ -125,11 +125,8 @@ def test_a_list_of_ablations_sets_what_its_parts_set() -> None:
 def test_the_sum_over_steps_is_T_times_the_mean(toy: Path) -> None:
     loss_gradients = {}
     for ablation in ("none", "sum_over_steps"):
-        config = ["loss.static_weight=0", "optimizer.clip_norm=0", "model=gausim_paper", f"ablation={ablation}"]
-        torch.manual_seed(0)
-        module, datamodule = build(compose("train", [f"data.root={toy}", *TINY, *config]))
-        samples = [datamodule.index[SampleKey(i, 3)] for i in range(2)]
-        module.optimise(samples, module.configure_optimizers(), torch.Generator().manual_seed(0))
+        module, samples = fresh(toy, ablation, "gausim_paper", "loss.static_weight=0", "optimizer.clip_norm=0")
+        train(module, samples, 1)
         loss_gradients[ablation] = {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
     mean, total = loss_gradients["none"], loss_gradients["sum_over_steps"]
     assert mean.keys() == total.keys() and any(bool(value.any()) for value in mean.values())

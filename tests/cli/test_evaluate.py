@@ -1,15 +1,22 @@
+"""`gausim evaluate` and `gausim simulate` of a run that knows the true motion."""
+
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 from helpers import toy_object
 from helpers.played import stand_in
 
-from gausim.cli import evaluate, evaluate_run, simulate_run
+from gausim.cli import evaluate, evaluate_run, simulate, simulate_run
 from gausim.compose import build
-from gausim.core import DataError, SimState
+from gausim.core import ConfigError, DataError, GausSimError, SimState
+from gausim.io.trajectory import load_trajectory
+from gausim.io.video import read_video
 
 
 @pytest.fixture
@@ -71,8 +78,48 @@ def test_an_unfinished_run_is_measured_with_a_warning_and_lists_its_tables_on_de
     assert json.loads((run.run_dir / "here" / "metrics.json").read_text())["run"]["finished"] is False
 
 
-def test_what_is_not_there_is_named(run):
-    with pytest.raises(DataError, match=r"no object \['cat'\]; it has \['toy'\]"):
-        evaluate.main([str(run.run_dir), "--object", "cat"])
-    with pytest.raises(DataError, match="no sequence .*seq_7"):
-        evaluate.main([str(run.run_dir), "--sequences", "seq_7"])
+def test_a_sequence_gives_all_files(run, capsys):
+    assert simulate.main([str(run.run_dir), "--gif"]) == 0
+    folder = run.run_dir / "simulation" / "toy" / "seq_000"
+    views = [f"{view}{end}" for view in ("cam_0", "cam_2") for end in (".gif", ".mp4", "_sheet.png", "_slices.png")]
+    assert {p.name for p in folder.iterdir()} == {*views, "errors.png", "trajectory.safetensors"}
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("toy seq_000: On frames never seen (8–19), its points are 0.00 times as far off")
+    assert lines[1] == f"videos: {folder.parent.as_uri()}" and len(lines) == 4
+    assert lines[3].split() == ["gausim", "simulate", str(run.run_dir), *"--force on=tip weights=3 direction=x".split()]
+    frames = list(read_video(folder / "cam_2.mp4"))
+    assert len(frames) == 20 and frames[0].shape[1] == 3 * 320
+    # The prediction is the truth here: the first two panels agree, the error panel is dark.
+    left, middle, right = np.split(frames[12][30:330].astype(int), 3, axis=1)
+    assert np.abs(left - middle).mean() < 4 < left.mean() and right.mean() < 4
+    saved = load_trajectory(folder / "trajectory.safetensors")
+    assert saved.frames == 20 and saved.fps == 24.0
+    toy_scene = run.module.model.scenes[0]
+    assert torch.equal(saved.positions[0], toy_scene.means)
+
+
+def test_more_frames_than_were_recorded_of_all_sequences(run):
+    options = ["--sequence", "all", "--view", "cam_1", "--frames", "26", "--out", str(run.run_dir / "out")]
+    assert simulate.main([str(run.run_dir), *options, "--background", "white", "--brighten", "1.2"]) == 0
+    assert {p.name for p in (run.run_dir / "out" / "toy").iterdir()} == {"seq_000", "seq_001"}
+    folder = run.run_dir / "out" / "toy" / "seq_001"
+    frames = list(read_video(folder / "cam_1.mp4"))
+    assert len(frames) == 26 and load_trajectory(folder / "trajectory.safetensors").frames == 26
+    assert frames[5][40, 20].min() > 240 > 40 > frames[25][40, 20].max()  # beyond the recording there is no truth
+
+
+@pytest.mark.parametrize(
+    ("command", "asked", "error", "message"),
+    [
+        (evaluate.main, ["--object", "cat"], DataError, r"no object \['cat'\]; it has \['toy'\]"),
+        (evaluate.main, ["--sequences", "seq_7"], DataError, "no sequence .*seq_7"),
+        (simulate.main, ["--sequence", "seq_9"], DataError, "seq_9"),
+        (simulate.main, ["--view", "cam_9"], DataError, "cam_9"),
+        (simulate.main, ["--background", "mauve"], ConfigError, "--background mauve"),
+    ],
+)
+def test_what_is_not_there_is_named(
+    run, command: Callable[[list[str]], int], asked: list[str], error: type[GausSimError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        command([str(run.run_dir), *asked])

@@ -124,22 +124,17 @@ def test_frames_as_gltf(run) -> None:
         (["RUN", "--format", "usd", "--out", "m.txt"], ConfigError, "ends in .usd"),
         (["t.safetensors", "--format", "ply"], ConfigError, "name its rest scene with --scene"),
         (["t.safetensors", "--format", "ply", "--scene", "s.ply"], DataError, "t.safetensors: no such file"),
-        (
-            ["t.safetensors", "--format", "gif", "--scene", "other.ply"],
-            DataError,
-            "has 36 kernels, but other.ply has 9",
-        ),
+        (["t.safetensors", "--format", "gif", "--scene", "nine.ply"], DataError, "has 36 kernels, but nine.ply has 9"),
     ],
 )
 def test_what_cannot_be_exported(run, argv: list[str], error: type[Exception], message: str) -> None:
     if "usd" in " ".join(argv):
         pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
-    if "other.ply" in argv:
-        assert (
-            export.main([str(run.run_dir), "--format", "safetensors", "--frames", "2", "--out", "t.safetensors"]) == 0
-        )
+    if "nine.ply" in argv:
+        stored = ["--format", "safetensors", "--frames", "2", "--out", "t.safetensors"]
+        assert export.main([str(run.run_dir), *stored]) == 0
         scene = run.module.model.scenes[0]
-        save_scene(scene.select(torch.arange(scene.count) < 9), "other.ply")
+        save_scene(scene.select(torch.arange(scene.count) < 9), "nine.ply")
     argv = [str(run.run_dir) if word == "RUN" else word for word in argv]
     with pytest.raises(error, match=message):
         export.main(argv)

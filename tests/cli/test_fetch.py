@@ -1,4 +1,4 @@
-"""`gausim fetch`: from a trained run through an archive and a server to a run that works elsewhere."""
+"""`gausim fetch`: from a trained run through an archive and a server to a run that works elsewhere; where data lie."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from helpers.joint_runs import PAPER, weights
 from helpers.local_server import serving
 from helpers.toy_object import write_toy_object
 
-from gausim.cli import bring, card, fetch, simulate
+from gausim.cli import card, fetch, simulate
 from gausim.cli import train as command
 from gausim.compose.build import load_run
-from gausim.core import BusyError, DataError, FetchError, RunError
+from gausim.compose.data_paths import data_option, located, outside_files
+from gausim.core import BusyError, ConfigError, DataError, FetchError, RunError
 from gausim.io import download
 from gausim.io.files import sha256
 from gausim.runs.files import sole_writer
@@ -182,7 +183,7 @@ def test_a_hostile_archive_leaves_nothing(mirror: Path, name: str, what: str) ->
 
 def test_a_full_disk_is_left_clean(published: Path, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(bring.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
+        patch.setattr(fetch.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
         with pytest.raises(FetchError, match=r"expected \d+ bytes of free space for toy, found 1. Make room"):
             fetch.main(asked(published))
     write = Path.open
@@ -240,3 +241,36 @@ def test_only_what_others_can_use_is_packed(published: Path, capsys) -> None:
     os.remove("outputs/fetched/toy/FINISHED")
     with pytest.raises(RunError, match="expected a finished run"):
         fetch.main(["--pack", "outputs/fetched/toy", "--name", "again", "--licence", "MIT"])
+
+
+def test_words_become_keys_of_the_data_configuration():
+    assert data_option([]) == {}
+    assert data_option(["a"]) == {"root": "a"}
+    assert data_option(["a", "root=b=c", "scene=s.ply"]) == {"root": ["a", "b=c"], "scene": "s.ply"}
+    assert data_option(["odd=name"]) == {"root": "odd=name"}
+    with pytest.raises(ConfigError, match="--data masks=b: masks is given twice"):
+        data_option(["masks=a", "masks=b"])
+
+
+def test_entries_keep_what_else_they_say(tmp_path: Path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    own = {"root": ["/gone", {"root": "/gone/too", "selections": {"pinned": "z=0.1"}}], "names": ["x"]}
+    found = located(tmp_path, own, data_option([str(tmp_path / "a"), str(tmp_path / "b")]))
+    assert found["root"] == [str(tmp_path / "a"), {"root": str(tmp_path / "b"), "selections": {"pinned": "z=0.1"}}]
+    assert found["names"] == ["x"]
+    with pytest.raises(DataError, match="field data.root names /gone/too"):
+        located(tmp_path, {"root": [str(tmp_path / "a"), own["root"][1]]}, {})
+
+
+def test_a_scene_that_is_gone_is_taken_from_the_run(tmp_path: Path):
+    (tmp_path / "set").mkdir()
+    entry = {"root": str(tmp_path / "set"), "scene": "/gone/bunny.ply"}
+    own = {"root": [entry], "scene": None, "masks": None}
+    with pytest.raises(DataError, match=r"field data.root\[0\].scene names /gone/bunny.ply, expected a file"):
+        located(tmp_path, own, {})
+    (tmp_path / "scenes").mkdir()
+    for name in ("bunny.ply", "bunny.masks.npz"):
+        (tmp_path / "scenes" / name).write_text("")
+    assert located(tmp_path, own, {})["root"][0]["scene"] == str(tmp_path / "scenes" / "bunny.ply")
+    assert outside_files(tmp_path, own) == [tmp_path / "scenes" / n for n in ("bunny.ply", "bunny.masks.npz")]

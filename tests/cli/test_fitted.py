@@ -44,8 +44,7 @@ SMALL: dict[str, list[str]] = {
     "physgaussian": ["model.method.discretisation.cells=12", f"{STAGES}.velocity.iterations=4", "model.plan.round=2"],
 }  # fmt: skip
 # The material point method needs warp-lang (extra 'baselines'); one method stands for all in the default tests.
-SLOW = {name: [pytest.mark.slow] for name in SMALL if name != "spring_mass"}
-METHODS = [pytest.param(name, marks=SLOW.get(name, [])) for name in SMALL]
+METHODS = [pytest.param(name, marks=[pytest.mark.slow] * (name != "spring_mass")) for name in SMALL]
 
 
 @pytest.fixture(scope="module")

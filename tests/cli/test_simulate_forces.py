@@ -1,29 +1,47 @@
-"""Forces and sessions on the command line: files are written, replays are the same, wrong words are named."""
+"""Forces and sessions: files are written, replays are the same, wrong words are named, a thousand steps stay sound."""
 
 from __future__ import annotations
 
 import json
+import random
 import re
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
+from helpers.simulators import LEVELS
 from msgspec.structs import replace
 
-from gausim.cli import main, simulate
+from gausim.cli import main, simulate, train
+from gausim.compose.build import load_run
+from gausim.compose.live import ENERGY_ROOM, open_interaction
 from gausim.core import DataError
 from gausim.interaction import words as _force_words
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
-from gausim.interaction.session import Force, Impulse, load_session, save_session
+from gausim.interaction.session import (
+    Event,
+    Force,
+    Gravity,
+    Impulse,
+    Pin,
+    Release,
+    Unpin,
+    Wind,
+    load_session,
+    save_session,
+)
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
+from gausim.ops.covariance import covariance_from_scales
 
 
 def same(a: Path, b: Path) -> bool:
     first, second = load_trajectory(a), load_trajectory(b)
-    return all(
-        torch.equal(getattr(first, n), getattr(second, n)) for n in ("positions", "deformation_gradients", "rotations")
-    )
+    names = ("positions", "deformation_gradients", "rotations")
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
 
 
 def test_forces_write_files_and_their_session_replays_them(played, tmp_path: Path, capsys) -> None:
@@ -68,15 +86,8 @@ def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) ->
     assert session.made_with.initial == "seq_001"
     other = replace(session, made_with=replace(session.made_with, model_hash="0", run="elsewhere/seed_3"))
     save_session(other, tmp_path / "other.json")
-    replayed = [
-        str(played.run_dir),
-        "--session",
-        str(tmp_path / "other.json"),
-        "--view",
-        "cam_0",
-        "--out",
-        str(tmp_path),
-    ]
+    replayed = [str(played.run_dir), "--session", str(tmp_path / "other.json"), "--view", "cam_0"]
+    replayed += ["--out", str(tmp_path)]
     assert simulate.main(replayed) == 0
     assert "another method or training (run 'elsewhere/seed_3')" in capsys.readouterr().err
     folder = tmp_path / "toy"
@@ -120,14 +131,66 @@ def test_parts_and_directions(played) -> None:
     scene = played.module.model.scenes[0]
     entry = _force_words.entry_of("force", ["weights=2", "direction=-y", "at=3"], scene)
     assert entry.at == 3 and entry.event == Force(Whole(), (0.0, -1.0, 0.0), 2.0)
-    parts = {
-        "unit:1/7": Unit(1, 7),
-        "kernels:0-2,5": Kernels((0, 1, 2, 5)),
-        "ball:1,2,3,0.5": Ball((1.0, 2.0, 3.0), 0.5),
-    }
-    for text, part in parts.items():
-        assert _force_words.parse_part(text, scene) == part
+    assert _force_words.parse_part("unit:1/7", scene) == Unit(1, 7)
+    assert _force_words.parse_part("kernels:0-2,5", scene) == Kernels((0, 1, 2, 5))
+    assert _force_words.parse_part("ball:1,2,3,0.5", scene) == Ball((1.0, 2.0, 3.0), 0.5)
     tip = _force_words.parse_part("tip:0.2", scene)
     assert tip.radius == 0.2 and tip.centre[2] == pytest.approx(1.05)
     impulse = _force_words.entry_of("impulse", ["weight_seconds=.1", "direction=1,2,-3"], scene).event
     assert impulse == Impulse(Whole(), (1.0, 2.0, -3.0), 0.1)
+
+
+TINY = (
+    LEVELS, "model.simulator.template.modes=8", "model.simulator.network.hidden=8", "data.curriculum.t_max=3",
+    "data.repeats=1", "data.batch_size=2", "trainer.max_epochs=4", "trainer.accelerator=cpu", "trainer.progress=false",
+    "trainer.threads=1", "render=reference", "callbacks.panels=null", "logger=none", "name=toy",
+)  # fmt: skip
+
+
+def random_event(r: random.Random, live: Interaction) -> Event:
+    scene = live.scene
+    kernel = r.choice((scene.simulated & ~scene.pinned).nonzero()[:, 0].tolist())
+    ball = Ball(tuple(scene.means[kernel].tolist()), r.choice([0.1, 0.3]))
+    part = r.choice([ball, Unit(1, int(live.units[0][kernel])), Whole()])
+    direction = (r.gauss(0, 1), r.gauss(0, 1), r.gauss(0, 1))
+    size = live.most_force * r.choice([1.0, r.random()])
+    kinds = {
+        "force": Force(part, direction, size, frames=r.choice([1, 6, 40]), name=str(r.randrange(3))),
+        "impulse": Impulse(part, direction, size / live.fps * (1 - 1e-9)),
+        "wind": Wind(direction, r.choice([0.0, size]), gusts=r.random()),
+        "gravity": Gravity(direction, r.choice([0.0, size])),
+        "pin": Pin(ball), "unpin": Unpin(), "release": Release(),
+    }  # fmt: skip
+    return kinds[r.choice([*kinds, "force", "force"])]
+
+
+@pytest.mark.slow
+def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = toy_object.write_toy_object(tmp_path / "data" / "toy").root
+    assert train.main([f"data.root={root}", *TINY]) == 0
+    run = load_run("outputs/toy/seed_0")
+    live = open_interaction(run, keep=None)
+    scene, r = live.scene, random.Random(0)
+    held = scene.pinned | ~scene.simulated
+    rest = covariance_from_scales(scene.log_scales.double(), scene.quats.double())
+    for _ in range(1000):
+        for _ in range(r.choice([0, 0, 1, 2])):
+            live.act(random_event(r, live))
+        before, pinned = live.frame.positions, live.held.clone()
+        frame = live.step()
+        assert torch.isfinite(frame.positions).all() and torch.isfinite(frame.rotations).all()
+        gradient = frame.deformation_gradients.double()[live.unit_of_kernel]
+        assert float(torch.linalg.eigvalsh(gradient @ rest @ gradient.mT).min()) > 0
+        assert torch.equal(frame.positions[held], scene.means[held])
+        assert torch.equal(frame.positions[pinned], before[pinned])
+    recorded, session = live.trajectory(), live.session()
+    assert len(session.entries) > 500
+    moved = (recorded.positions - scene.means).norm(dim=-1).amax(1) / scene.diagonal
+    assert 0.02 < float(moved.max()) < 2
+    start = replace(session, steps=100, entries=tuple(e for e in session.entries if e.at < 100))
+    again = replay(open_interaction(load_run("outputs/toy/seed_0")), start)
+    assert torch.equal(again.positions, recorded.positions[:101])
+    assert torch.equal(again.deformation_gradients, recorded.deformation_gradients[:101])
+    ceiling = live._dynamics.energy_ceiling
+    assert ceiling is not None and ceiling > 0 and ENERGY_ROOM > 1

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import torch
 import yaml
 from helpers.joint_runs import PAPER, weights
 from helpers.shared import Shared
-from helpers.toy_object import toy_scene
+from helpers.simulators import LEVELS
+from helpers.toy_object import toy_scene, write_toy_object
 from helpers.toy_runs import rows
 
 from gausim.cli import evaluate
@@ -19,6 +22,7 @@ from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
 from gausim.io.ply import save_scene
+from gausim.runs.checkpoint import read_checkpoint
 
 RUN = Path("outputs/toy/seed_0")
 
@@ -158,3 +162,24 @@ def test_a_run_may_be_evaluated_when_it_is_trained(again: list[str], monkeypatch
         with pytest.raises(RunError, match="finished"):
             command.main([*asked, *more])
     assert len(calls) == 2
+
+
+@pytest.mark.slow  # compiles everything from nothing
+def test_the_process_that_compiles_trains_to_the_same_bits_as_one_that_loads_from_the_cache(tmp_path: Path) -> None:
+    toy = write_toy_object(tmp_path / "toy", frames=8).root
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "compiled"), "OMP_NUM_THREADS": "1"}
+    states, compiled = [], []
+    for run in ("first", "second"):
+        command = [
+            sys.executable, "-m", "gausim.cli.main", "train", f"data.root={toy}", "render=cpu", "trainer.threads=1",
+            "trainer.accelerator=cpu", "trainer.max_epochs=2", "trainer.progress=false", "data.curriculum.t_max=3",
+            "data.repeats=1", "data.batch_size=2", LEVELS,
+            "logger=none", f"hydra.run.dir={tmp_path / run}",
+        ]  # fmt: skip
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        (checkpoint,) = tmp_path.glob(f"{run}/**/last.ckpt")
+        states.append(read_checkpoint(checkpoint)["state_dict"])
+        compiled.append({file: file.stat().st_mtime_ns for file in (tmp_path / "compiled").rglob("*.nbc")})
+    assert compiled[0] and compiled[0] == compiled[1]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from gausim.cli.arguments import command_parser
+from gausim.compose.data_paths import located
+from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
@@ -38,7 +40,10 @@ def main(argv: list[str]) -> int:
 
     source = RunDirectory(arguments.run)
     config = _config(source.config(), source.path, arguments)
-    run = RunDirectory(arguments.out or _beside(source.path, arguments.frames))
+    # outputs/bunny/seed_0 -> outputs/bunny_adapted_16/seed_0, so that seeds stay in the folder of one experiment.
+    path = source.path.resolve()
+    beside = path.parent.with_name(f"{path.parent.name}_adapted_{arguments.frames}") / path.name
+    run = RunDirectory(arguments.out or beside)
     with run.writing():
         train_run(OmegaConf.create(config), run)
     return 0
@@ -60,18 +65,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _beside(run: Path, frames: int) -> Path:
-    """outputs/bunny/seed_0 -> outputs/bunny_adapted_16/seed_0, so that seeds stay in the folder of one experiment."""
-    path = run.resolve()
-    return path.parent.with_name(f"{path.parent.name}_adapted_{frames}") / path.name
-
-
 def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """The run's configuration with the settings of adaptation, then the overrides."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-
-    from gausim.core.errors import ConfigError
 
     if arguments.frames < 2:
         raise ConfigError(f"--frames: expected at least 2 (frame 0 shows rest only), got {arguments.frames}.")
@@ -109,7 +106,6 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
 
 def _checked(overrides: Sequence[str]) -> list[str]:
     from gausim.compose.places import spelled
-    from gausim.core.errors import ConfigError
 
     for text in overrides:
         if "=" not in text.lstrip("="):
@@ -122,8 +118,6 @@ def _checked(overrides: Sequence[str]) -> list[str]:
 def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:
     """Entries of data.root: the stores' objects that are in the run, each with the rest scene of its training."""
     from gausim.compose.config import instantiate
-    from gausim.compose.data_paths import located
-    from gausim.core.errors import DataError
     from gausim.data.objects import ObjectData, find_objects
 
     data = {**located(run, config["data"], {}), "sequences": None}

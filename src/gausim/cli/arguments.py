@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.main import COMMANDS
+from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -73,7 +74,7 @@ def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options:
     """
     from gausim.compose.bare import EvenMaterial, open_scene
 
-    given = {name: getattr(arguments, name) for name in ("stiffness", "damping")}
+    given = {"stiffness": arguments.stiffness, "damping": arguments.damping}
     material = {name: value for name, value in given.items() if value is not None}
     even = EvenMaterial(**material) if material else None
     return open_scene(scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=even, **options)
@@ -94,8 +95,6 @@ def parse_background(text: str) -> Tensor | None:
         ConfigError: the text is neither a name nor three numbers in 0..1.
     """
     import torch
-
-    from gausim.core.errors import ConfigError
 
     if text == "black":
         return None

@@ -9,6 +9,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.arguments import command_parser, positive
+from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from gausim.benchmark.harness import Options, Row
@@ -75,8 +76,6 @@ def _parser() -> argparse.ArgumentParser:
 def _device(name: str) -> Any:
     import torch
 
-    from gausim.core.errors import ConfigError
-
     try:
         device = torch.device(name)
     except RuntimeError as error:
@@ -94,7 +93,6 @@ def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -
         return list(case.run(options))
     from gausim.compose.build import build
     from gausim.compose.config import compose
-    from gausim.core.errors import DataError
 
     overrides = overrides or list(DEFAULT_OVERRIDES)
     config = compose("train", overrides)
@@ -121,8 +119,8 @@ def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
 
 def _print(name: str, rows: list[Row]) -> None:
     print(f"\n{name}")
-    cases, metrics = (max((len(text) for text in column), default=0)
-                      for column in ([r.case for r in rows], [r.metric for r in rows]))  # fmt: skip
+    cases = max((len(row.case) for row in rows), default=0)
+    metrics = max((len(row.metric) for row in rows), default=0)
     for row in rows:
         reference = f"  ({row.reference})" if row.reference else ""
         value, unit = _readable(row.value, row.unit)

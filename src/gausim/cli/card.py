@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.arguments import add_data_option, command_parser
+from gausim.compose.data_paths import data_option, listed, located
+from gausim.core.errors import ConfigError, DataError, RunError
 
 if TYPE_CHECKING:
     from gausim.report.card import CardFacts
@@ -31,7 +33,6 @@ _ABSENT = "(absent)"
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    from gausim.core.errors import RunError
     from gausim.io.files import write_durably
     from gausim.report.card import CARD, card
 
@@ -61,7 +62,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _record(folder: Path) -> RunRecord:
-    from gausim.core.errors import RunError
     from gausim.report.gather.runs import BROKEN, find_runs
 
     found = find_runs([folder])
@@ -93,8 +93,6 @@ def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
 
 def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | None:
     """Content of ``dataset.json`` per object; None if the data set is not on this machine."""
-    from gausim.compose.data_paths import data_option, listed, located
-    from gausim.core.errors import DataError
     from gausim.data.objects import find_objects
     from gausim.io.transforms import read_json
 
@@ -112,7 +110,6 @@ def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | No
 
 
 def _endurance(path: Path) -> dict[str, Any]:
-    from gausim.core.errors import RunError
     from gausim.io.plain_json import parse_json
 
     if not path.is_file():
@@ -157,7 +154,6 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
 
     import gausim
     from gausim.compose.config import compose
-    from gausim.core.errors import ConfigError
     from gausim.runs.defaults import flatten, with_defaults
 
     chosen = [f"{group}={run.choices[group]}" for group in _GROUPS if run.choices.get(group) not in (None, "None")]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
+from importlib.resources import files
 
 from gausim.cli.arguments import command_parser
 
@@ -42,52 +44,40 @@ def main(argv: Sequence[str]) -> int:
         sys.stdout.writelines(f"{choice}\n" for choice in complete(argv[1:]))
         return 0
     arguments = _parser().parse_args(argv)
-    status: int = arguments.run(arguments)
-    return status
+    if arguments.part == "validate":
+        return _validate(arguments.what)
+    if arguments.part == "schema":
+        from gausim.compose.schema import training_schema
+
+        print(json.dumps(training_schema(), indent=1))
+    else:
+        print((files("gausim.cli") / "shells" / f"gausim.{arguments.shell}").read_text(), end="")
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("config")
-    parts = parser.add_subparsers(metavar="WHAT", required=True)
+    parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
 
     def add(name: str, help: str, text: str) -> argparse.ArgumentParser:
         return parts.add_parser(name, help=help, description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
 
     validate = add("validate", "compose and check a configuration without training", VALIDATE)
     validate.add_argument("what", nargs="*", metavar="FILE|KEY=VALUE", help="nothing: the default configuration")
-    validate.set_defaults(run=_validate)
-    add("schema", "print the JSON schema of the training configuration", SCHEMA).set_defaults(run=_schema)
+    add("schema", "print the JSON schema of the training configuration", SCHEMA)
     completion = add("completion", "print the completion script of a shell", COMPLETION)
     completion.add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
-    completion.set_defaults(run=_completion)
     return parser
 
 
-def _validate(arguments: argparse.Namespace) -> int:
+def _validate(what: Sequence[str]) -> int:
     from gausim.compose.validate import faults
 
-    found = faults(arguments.what)
+    found = faults(what)
     for fault in found:
         print(fault)
     if found:
         print(f"{len(found)} {'fault' if len(found) == 1 else 'faults'}", file=sys.stderr)
         return 1
     print("the configuration is in order")
-    return 0
-
-
-def _schema(arguments: argparse.Namespace) -> int:
-    import json
-
-    from gausim.compose.schema import training_schema
-
-    json.dump(training_schema(), sys.stdout, indent=1)
-    print()
-    return 0
-
-
-def _completion(arguments: argparse.Namespace) -> int:
-    from importlib.resources import files
-
-    print((files("gausim.cli") / "shells" / f"gausim.{arguments.shell}").read_text(), end="")
     return 0

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.core.errors import DataError
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.data.objects import ObjectData
-    from gausim.doctor.examine import Examination
 
 
 def main(argv: list[str]) -> int:
@@ -55,7 +55,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     from gausim.data.objects import ObjectData
     from gausim.data.verify import verify
     from gausim.doctor.examine import examine
-    from gausim.doctor.page import findings_text, plain_findings
+    from gausim.doctor.page import findings_text, plain_findings, write_page
 
     # Masks and pins are checked below: options may set them, and missing pins are one of the findings.
     faults = verify(root, quick=True, scene=False)
@@ -67,29 +67,23 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
         return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
     data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)
     found = examine(data, _scene(data, arguments))
-    page = "" if out is None or found.evidence is None else _show(found, out)
     if not arguments.json:
-        print(findings_text(str(root), found), page, sep="")
+        print(findings_text(str(root), found))
+    if out is not None and found.evidence is not None:
+        from gausim.doctor.pictures import draw_pictures  # loads Matplotlib
+
+        write_page(out / "index.html", found, draw_pictures(found.evidence, out))
+        if not arguments.json:
+            print(f"page  {out / 'index.html'}")
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
 
 def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | None:
     """The rest scene with the requested pins; None if the object has no scene yet."""
-    from gausim.core.errors import DataError
     from gausim.io.ply import load_scene
 
     if not data.scene_path.is_file():
         if arguments.scene is not None:
             raise DataError(f"{data.scene_path}: no such file. Give --scene the PLY that `gausim reconstruct` wrote.")
         return None
-    scene = load_scene(data.scene_path, masks=data.masks_path, name=data.name)
-    return pinned_by(scene, arguments)
-
-
-def _show(found: Examination, out: Path) -> str:
-    from gausim.doctor.page import write_page
-    from gausim.doctor.pictures import draw_pictures
-
-    assert found.evidence is not None
-    write_page(out / "index.html", found, draw_pictures(found.evidence, out))
-    return f"\npage  {out / 'index.html'}"
+    return pinned_by(load_scene(data.scene_path, masks=data.masks_path, name=data.name), arguments)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markdown import Markdown
 
-from gausim.cli.bars import named_bar
-from gausim.cli.end import end, error_sentences
+from gausim.cli.output import end, error_sentences, named_bar
 from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
 from gausim.compose.data_paths import data_option
 from gausim.compose.predict import TrainedPrediction, endurance, run_objects, scene_of, sequence_of, state_of
@@ -38,14 +35,16 @@ def evaluate(arguments: argparse.Namespace) -> int:
         return _evaluate_bodies(arguments)
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
-    chosen = choose(run, arguments)
+    part, sequences = _choose(run, arguments)
     if arguments.test:
-        facts |= look(run, arguments, chosen, facts)
+        facts |= _look(run, arguments, sequences, facts)
         run = load_run(arguments.run, data=data_option(arguments.data))  # now the test part is open
-    elif chosen.part:
-        facts |= {"part": chosen.part}
-    results = _evaluate(run, arguments, chosen)
-    whole, folder = _folder(run, arguments, chosen.part)
+    elif part:
+        facts |= {"part": part}
+    results = _evaluate(run, arguments, sequences)
+    whole = _home(run.run_dir, part)
+    partial = arguments.object or arguments.sequences or arguments.views != "all"  # never overwrites the whole
+    folder = arguments.out or (whole / "partial" if partial else whole)
     summary = write_evaluation(folder, results, facts)
     drawn: list[str] = []
     for curves in results:
@@ -62,8 +61,9 @@ def evaluate(arguments: argparse.Namespace) -> int:
         # Rich would truncate columns at 80 characters in files.
         Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
-    commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
-    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *commands)
+    commands = ["report", "simulate"] if folder == run.run_dir / "evaluation" else ["evaluate"]
+    following = [[command, arguments.run] for command in commands]
+    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *following)
     return 0
 
 
@@ -98,16 +98,16 @@ def _pretrained(run: Path, trainable: int) -> int | None:
     return trainable if bodies is None else int(bodies)
 
 
-def _evaluate(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen) -> list[ObjectCurves]:
-    items = run_objects(run, list(chosen.sequences))
-    with named_bar(sum(map(len, chosen.sequences.values())), "evaluate") as advance:
+def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str, list[str]]) -> list[ObjectCurves]:
+    items = run_objects(run, list(sequences))
+    with named_bar(sum(map(len, sequences.values())), "evaluate") as advance:
         return [
             evaluate_object(
                 item.data,
                 scene_of(run, item),
                 {run.module.method_name: TrainedPrediction(run, item)},
                 run.renderer,
-                sequences=chosen.sequences[item.data.name],
+                sequences=sequences[item.data.name],
                 views=_views(item.data, arguments.views),
                 advance=advance,
             )
@@ -134,29 +134,8 @@ def _views(data: ObjectData, group: str) -> list[str]:
     return list(chosen)
 
 
-def _folder(run: LoadedRun, arguments: argparse.Namespace, part: str | None) -> tuple[bool, Path]:
-    """Whether the evaluation covers the whole run (a partial one never overwrites it), and its folder."""
-    whole = home(run.run_dir, part)
-    partial = arguments.object or arguments.sequences or arguments.views != "all"
-    folder = arguments.out or (whole / "partial" if partial else whole)
-    return folder == run.run_dir / "evaluation", folder
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """Sequences to evaluate."""
-
-    part: str | None  # ``development`` or ``test``; None where the data declare no test part
-    sequences: Mapping[str, list[str]]  # their names by object
-
-
-def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:
-    """The sequences that are asked for, of one part.
-
-    Raises:
-        ConfigError: no sequence belongs to the part, or ``--test`` or ``--trials`` does not apply.
-        DataError: an object or sequence does not exist, or a sequence belongs to the other part.
-    """
+def _choose(run: LoadedRun, arguments: argparse.Namespace) -> tuple[str | None, dict[str, list[str]]]:
+    """The part to evaluate (None where the data declare no test part), and names of its sequences by object."""
     items = run_objects(run, arguments.object)
     declared = any({r.name for r in item.data.sequences} & item.data.test_part for item in items)
     if not declared and (arguments.test or arguments.trials):
@@ -184,39 +163,31 @@ def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:
             if not arguments.test
             else f"{run.run_dir}: no sequence of the chosen objects belongs to the test part. Leave --test out."
         )
-    return Chosen((TEST_PART if arguments.test else DEVELOPMENT) if declared else None, found)
+    return (TEST_PART if arguments.test else DEVELOPMENT) if declared else None, found
 
 
-def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Records a look at the test part; returns what the summary says of it.
-
-    Raises:
-        ConfigError: the number of trials is not declared.
-    """
+def _look(
+    run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str, list[str]], state: dict[str, Any]
+) -> dict[str, Any]:
+    """Records a look at the test part; returns what the summary says of it."""
     trials = arguments.trials or (run.config.get("protocol") or {}).get("trials")
     if not trials:
         raise ConfigError(
             "--test: expected the number of trials that were made of the method on the development part. Declare it "
             "with --trials N, or train with protocol.trials=N."
         )
-    path, development = run.run_dir / TEST, run.run_dir / "evaluation" / "development"
-    if not path.is_file():
-        _move(run.run_dir / "evaluation", development)
-    made = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=dict(chosen.sequences))
+    path, folder = run.run_dir / TEST, run.run_dir / "evaluation"
+    if not path.is_file() and (folder / "metrics.json").is_file():  # an earlier evaluation of the development part
+        (folder / DEVELOPMENT).mkdir(exist_ok=True)
+        for file in sorted(file for file in folder.iterdir() if file.is_file()):
+            file.replace(folder / DEVELOPMENT / file.name)
+    made = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=sequences)
     again = f", look {made.looks}" if made.looks > 1 else ""
     print(f"test part: {trials} trials declared{again}; recorded in {path}")
-    return {"part": chosen.part, "trials": trials, "looks": made.looks}
+    return {"part": TEST_PART, "trials": trials, "looks": made.looks}
 
 
-def home(run_dir: Path, part: str | None) -> Path:
+def _home(run_dir: Path, part: str | None) -> Path:
     """Folder of a whole evaluation: that of the development part makes room for the test part once it was looked at."""
     folder = run_dir / "evaluation"
     return folder / DEVELOPMENT if part == DEVELOPMENT and (run_dir / TEST).is_file() else folder
-
-
-def _move(folder: Path, target: Path) -> None:
-    """Moves the files of an earlier evaluation of the development part."""
-    if (folder / "metrics.json").is_file():
-        target.mkdir(parents=True, exist_ok=True)
-        for path in sorted(p for p in folder.iterdir() if p.is_file()):
-            path.replace(target / path.name)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import UPS, add_data_option, add_pin_options, command_parser, pinned_by
+from gausim.core.errors import SceneError
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
@@ -26,7 +27,6 @@ def main(argv: list[str]) -> int:
         from gausim.cli.inspect_material import show_material
 
         return show_material(arguments)
-    from gausim.core.errors import SceneError
     from gausim.io.ply import load_scene, masks_path, save_masks
     from gausim.models.hierarchy.clusters import build_hierarchy
 
@@ -92,8 +92,8 @@ def _print_scene(scene: GaussianScene) -> None:
     print("box        " + "  ".join(f"{a} {low[i]:.4g} .. {high[i]:.4g}" for i, a in enumerate("xyz")))
     if scene.simulated.any():
         print(f"diagonal   {scene.diagonal:.4g} scene units (simulated kernels)")
-    masks = [(n, int(getattr(scene, n).sum())) for n in ("simulated", "pinned", "foreground")]
-    print("masks      " + "  ".join(f"{n} {count}" for n, count in masks))
+    masks = {"simulated": scene.simulated, "pinned": scene.pinned, "foreground": scene.foreground}
+    print("masks      " + "  ".join(f"{name} {int(mask.sum())}" for name, mask in masks.items()))
     print(f"volume     c = {scene.volume_scale:.6g} (V = prod of c s_i)")
 
 

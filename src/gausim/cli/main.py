@@ -9,11 +9,9 @@ import sys
 from collections.abc import Callable, Sequence
 
 from gausim import __version__
+from gausim.core.errors import GausSimError
 
-EXIT_OK = 0
 EXIT_USAGE = 2
-# 128 + SIGINT, the exit status that shells report for an interrupted program.
-EXIT_INTERRUPTED = 130
 # Each command is a module of this package with a function `main(argv)`.
 COMMANDS = {
     "prepare": "Make a data set from films and photos, stage by stage; fetch the LPIPS weights.",
@@ -71,10 +69,7 @@ def _run(name: str, argv: list[str]) -> int:
             raise
         if isinstance(error, KeyboardInterrupt):
             print("interrupted", file=sys.stderr)
-            return EXIT_INTERRUPTED
-        # Imported here so that `gausim --help` loads no other package.
-        from gausim.core.errors import GausSimError
-
+            return 130  # 128 + SIGINT, which shells report for an interrupted program
         if not isinstance(error, GausSimError):
             raise
         print(f"error: {error}", file=sys.stderr)
@@ -86,10 +81,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, *rest = list(sys.argv[1:] if argv is None else argv) or [""]
     if name in ("-h", "--help", "help"):
         print(usage())
-        return EXIT_OK
+        return 0
     if name in ("-V", "--version"):
         print(f"gausim {__version__}")
-        return EXIT_OK
+        return 0
     if name not in COMMANDS:
         print(_unknown(name) if name else usage(), file=sys.stderr)
         return EXIT_USAGE

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gausim.compose.data_paths import SCENES, outside_files
+from gausim.compose.data_paths import FETCHED, SCENES, outside_files
 from gausim.core.errors import FetchError, RunError
 from gausim.data.objects import find_objects
 from gausim.io.archive import files_below, pack
@@ -18,7 +18,7 @@ from gausim.io.registry import Entry, check_name, entry_text
 from gausim.io.transforms import read_json
 from gausim.report.card import CARD
 from gausim.runs.checkpoint import LAST_CHECKPOINT, read_checkpoint
-from gausim.runs.directory import CONFIG, FETCHED, FINISHED, RunDirectory
+from gausim.runs.directory import CONFIG, FINISHED, RunDirectory
 from gausim.runs.names import EPOCHS, MOTION
 
 # Files of a run to publish; logs, panels and films are excluded, as they identify the machine and its user.
@@ -40,8 +40,8 @@ def pack_published(source: Path, out: Path, *, name: str, title: str | None, lic
     archive = out / f"{name}.tar"
     check_name(name)
     is_run = (source / CONFIG).is_file()
-    files, objects = _of_run(source) if is_run else _of_data(source)
-    known = licence or (None if is_run else _licence_of(source))
+    files, objects, stated = _of_run(source) if is_run else _of_data(source)
+    known = licence or stated
     if not known:
         raise FetchError(
             f"{source}: under which licence may others use it? Give --licence ID, e.g. CC-BY-4.0"
@@ -51,7 +51,13 @@ def pack_published(source: Path, out: Path, *, name: str, title: str | None, lic
     card = files.get(CARD)
     if card is not None:
         shutil.copyfile(card, out / f"{name}.md")
-    _say_what(source, archive, len(files), is_run=is_run, has_card=card is not None)
+    # Only the entry goes to the standard output.
+    print(f"wrote {archive} ({archive.stat().st_size / 1e6:,.1f} MB, {len(files)} files)", file=sys.stderr)
+    if is_run:
+        root = json.dumps(RunDirectory(source).config()["data"].get("root"))
+        print(f"note: its {CONFIG} contains the path of your data: {root}", file=sys.stderr)
+    if is_run and card is None:
+        print(f"note: the run has no card. Write one with `gausim card {source}` and pack again.", file=sys.stderr)
     entry = Entry(
         name=name, kind="run" if is_run else "data", file=archive.name, sha256=sha256(archive),
         title=title or f"{'trained on ' if is_run else ''}{', '.join(objects)}", size=archive.stat().st_size,
@@ -60,7 +66,8 @@ def pack_published(source: Path, out: Path, *, name: str, title: str | None, lic
     return f"# addresses: where {archive.name} will lie, URLs or paths relative to the registry.\n{entry_text(entry)}"
 
 
-def _of_run(source: Path) -> tuple[dict[str, Path], list[str]]:
+def _of_run(source: Path) -> tuple[dict[str, Path], list[str], str | None]:
+    """Files of a run by their names in the archive, its objects, and no licence."""
     run = RunDirectory(source)
     if not run.is_finished:
         raise RunError(f"{source}: expected a finished run, found none ({FINISHED} is missing). Train it to its end.")
@@ -69,7 +76,8 @@ def _of_run(source: Path) -> tuple[dict[str, Path], list[str]]:
     evaluation = source / "evaluation"
     if evaluation.is_dir():
         own |= {str(file.relative_to(source).as_posix()): file for file in files_below(evaluation)}
-    return own | _scenes(source, run.config()["data"]), [str(s["name"]) for s in checkpoint["gausim"]["scenes"]]
+    objects = [str(scene["name"]) for scene in checkpoint["gausim"]["scenes"]]
+    return own | _scenes(source, run.config()["data"]), objects, None
 
 
 def _scenes(source: Path, data: Mapping[str, Any]) -> dict[str, Path]:
@@ -82,28 +90,13 @@ def _scenes(source: Path, data: Mapping[str, Any]) -> dict[str, Path]:
     return found
 
 
-def _of_data(source: Path) -> tuple[dict[str, Path], list[str]]:
-    roots = find_objects(source)
-    files = {file.relative_to(source).as_posix(): file for file in files_below(source)}
-    files.pop(FETCHED, None)
-    return files, [str(read_json(root / "dataset.json").get("name", root.name)) for root in roots]
-
-
-def _licence_of(source: Path) -> str | None:
-    """The licence in the ``dataset.json`` of every object, if it is the same for all."""
-    licences = set()
+def _of_data(source: Path) -> tuple[dict[str, Path], list[str], str | None]:
+    """Files of a data set by their names in the archive, its objects, and their licence if all state the same."""
+    objects, licences = [], set()
     for root in find_objects(source):
         facts = read_json(root / "dataset.json")
+        objects.append(str(facts.get("name", root.name)))
         licences.add(next((facts[key] for key in _LICENCES if isinstance(facts.get(key), str)), None))
-    return licences.pop() if len(licences) == 1 else None
-
-
-def _say_what(source: Path, archive: Path, count: int, *, is_run: bool, has_card: bool) -> None:
-    """Prints remarks on the archive to the standard error; only the entry goes to the standard output."""
-    print(f"wrote {archive} ({archive.stat().st_size / 1e6:,.1f} MB, {count} files)", file=sys.stderr)
-    if not is_run:
-        return
-    root = json.dumps(RunDirectory(source).config()["data"].get("root"))
-    print(f"note: its {CONFIG} contains the path of your data: {root}", file=sys.stderr)
-    if not has_card:
-        print(f"note: the run has no card. Write one with `gausim card {source}` and pack again.", file=sys.stderr)
+    files = {file.relative_to(source).as_posix(): file for file in files_below(source)}
+    files.pop(FETCHED, None)
+    return files, objects, licences.pop() if len(licences) == 1 else None

@@ -11,6 +11,7 @@ from pathlib import Path
 import gausim
 from gausim.cli import prepare_lpips
 from gausim.cli.arguments import command_parser
+from gausim.core.errors import ConfigError
 
 # Modules of data_prep, with one line of help each.
 STAGES = {
@@ -56,8 +57,6 @@ def stages_root() -> Path:
     for candidate in candidates:
         if (candidate / "data_prep" / "__init__.py").is_file():
             return candidate
-    from gausim.core.errors import ConfigError
-
     raise ConfigError(
         f"expected the stages in {candidates[0] / 'data_prep'} or {candidates[1] / 'data_prep'}, found neither. "
         "Reinstall gausim, or run from a complete checkout."

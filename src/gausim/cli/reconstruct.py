@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
-from gausim.cli.bars import bars
+from gausim.cli.output import bars
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -35,10 +35,10 @@ def main(argv: list[str]) -> int:
     if (arguments.root is None) == (arguments.transforms is None):
         raise ConfigError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
     if arguments.root is not None:
-        source, default = Path(arguments.root) / "dataset.json", Path(arguments.root) / "scene.ply"
+        source = Path(arguments.root) / "dataset.json"
     else:
-        source, default = Path(arguments.transforms), Path(arguments.transforms).parent / "scene.ply"
-    print(fit_scene(source, Path(arguments.out or default), arguments)[1])
+        source = Path(arguments.transforms)
+    print(fit_scene(source, Path(arguments.out or source.parent / "scene.ply"), arguments)[1])
     return 0
 
 
@@ -70,11 +70,13 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     from gausim.io.ply import save_scene
     from gausim.reconstruction.state import Partial, identity
     from gausim.reconstruction.stills import measure
+    from gausim.render.cpu import CpuRenderer
+    from gausim.render.reference import ReferenceRenderer
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
     name, material, cloud = _inputs(source, arguments, options)
-    renderer = _renderer(arguments.renderer)
+    renderer = CpuRenderer() if arguments.renderer == "cpu" else ReferenceRenderer()
     start = time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
     scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments)
@@ -167,13 +169,6 @@ def _inputs(
     beside = source.parent / "points.npz"
     points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
     return source.parent.name or "scene", material, _cloud(points)
-
-
-def _renderer(name: str) -> Renderer:
-    from gausim.render.cpu import CpuRenderer
-    from gausim.render.reference import ReferenceRenderer
-
-    return CpuRenderer() if name == "cpu" else ReferenceRenderer()
 
 
 def _cloud(path: str | None) -> PointCloud | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import command_parser
+from gausim.cli.output import OWN_OBJECT, end, push
 from gausim.core.errors import ConfigError, RunError
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ def main(argv: list[str]) -> int:
         return _draw_bodies(arguments.dirs, arguments.bodies)
     if arguments.results or arguments.record:
         return _write_results(arguments)
-    from gausim.cli.end import end
     from gausim.report.write import summary_line, write_report
 
     out = arguments.out or arguments.dirs[0] / "report"
@@ -91,7 +91,6 @@ def _write_results(arguments: argparse.Namespace) -> int:
 
 def _next(report: Report) -> list[list[object]]:
     """Next commands for the best run, or without evaluations the commands that evaluate runs."""
-    from gausim.cli.end import OWN_OBJECT, push
     from gausim.report.gather.runs import NOT_EVALUATED
 
     if not report.openings:

@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from gausim.cli.arguments import opened_scene, parse_background, pinned_by
-from gausim.cli.bars import named_bar
-from gausim.cli.end import end, error_sentences, push
+from gausim.cli.output import end, error_sentences, named_bar, push
 from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.config import compose, instantiate
 from gausim.compose.data_paths import data_option
@@ -49,7 +48,7 @@ def simulate_run(arguments: argparse.Namespace) -> int:
     state_of(run)
     folder = arguments.out or run.run_dir / "simulation"
     if arguments.session or has_forces(arguments):
-        return simulate_forces(run, arguments, folder)
+        return _simulate_forces(run, arguments, folder)
     items = run_objects(run, arguments.object)
     sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
     first = items[0].data.name
@@ -122,14 +121,8 @@ def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | 
     return np.concatenate(parts)
 
 
-def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
-    """Simulates one object under forces; writes trajectory, session, videos and pictures; returns the exit status.
-
-    Raises:
-        ConfigError: options conflict, or an event is invalid.
-        DataError: the session is malformed or of another scene, or an object, sequence or view does not exist.
-        DivergenceError: a simulated position is not finite.
-    """
+def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
+    """Simulates one object under forces; writes trajectory, session, videos and pictures; returns the exit status."""
     if arguments.session and has_forces(arguments):
         raise ConfigError("--session has its own forces: leave --force and the like out, or edit the session's file.")
     if len(arguments.object or []) > 1 or len(arguments.sequence or []) > 1:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,10 +14,11 @@ from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
-from gausim.cli.end import end
+from gausim.cli.output import end
 from gausim.cli.sweeps.jobs import do_job
 from gausim.compose.build import build, load_run
-from gausim.compose.config import in_sweep, instantiate, run_dir
+from gausim.compose.config import instantiate, run_dir
+from gausim.compose.root import in_sweep
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.pretraining import CorpusDataModule
@@ -309,16 +309,12 @@ def _introduce(
             f"at most {epochs} epochs of {batches} steps, {shows} shows of each sequence; "
             f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames",
             *_slow_beginnings(module, shows),
-            *_other_settings(run.config()),
         ]
+        config = run.config()
+        source = config.get("init_from")
+        if source and (others := unlike(source, config["model"])):  # in another model weights mean something else
+            lines.append(f"warning: {source} was trained with other values of {', '.join(others)}")
     print("".join(f"  {line}\n" for line in lines), end="", flush=True)
-
-
-def _other_settings(config: Mapping[str, Any]) -> list[str]:
-    """A warning if the run that weights are taken from has another model, in which they mean something else."""
-    source = config.get("init_from")
-    others = unlike(source, config["model"]) if source else []
-    return [f"warning: {source} was trained with other values of {', '.join(others)}"] if others else []
 
 
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:

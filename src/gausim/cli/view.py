@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import UPS, add_data_option, add_scene_options, command_parser, opened_scene, pinned_by
+from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from gausim.cli.view_subject import Playable
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 def main(argv: list[str]) -> int:
     """Runs the command until it is interrupted; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    from gausim.core.errors import ConfigError
-
     try:
         from gausim.viewer.access import Access
         from gausim.viewer.app import Viewer
@@ -70,7 +69,6 @@ def _parser() -> argparse.ArgumentParser:
 
 def _subject(arguments: argparse.Namespace) -> Subject:
     from gausim.cli.view_subject import Playable, subject_of
-    from gausim.core.errors import ConfigError
     from gausim.io.ply import load_scene
 
     is_run, beside = arguments.what.is_dir(), None

@@ -43,16 +43,12 @@ def playable_run(
     return Playable(open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep), item, run)
 
 
-def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
-    """Predictions of the recorded sequences by the method, and by the method beside it."""
-    other = {} if beside is None else beside.predictions()
-    return [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
-
-
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """The complete content of the viewer."""
     films = cameras = companion = None
     material: dict[str, Property] = {}
+    other = {} if beside is None else beside.predictions()
+    takes = [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
     if made.run is not None and made.item is not None:
         records = {record.name: record for record in made.item.data.sequences}
         films = Films(records, made.interaction.scene, made.run.renderer)
@@ -63,6 +59,6 @@ def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, 
         name = f"{beside.run.module.method_name} ({Path(beside.run.run_dir).name})"
         companion = Companion(name, beside.interaction)
     return Subject(
-        title=title, interaction=made.interaction, takes=takes_of(made, beside), companion=companion, films=films,
-        cameras=cameras, material=material, up=up, sessions=sessions,
+        title=title, interaction=made.interaction, takes=takes, companion=companion, films=films, cameras=cameras,
+        material=material, up=up, sessions=sessions,
     )  # fmt: skip

@@ -81,7 +81,10 @@ def open_scene(
         raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
-    model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base)
+    if base is None:
+        model = _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
+    else:
+        model = _of_base(scene, fps, base)
     if material is None and base is not None:
         material = EvenMaterial()
     if material is not None:
@@ -95,10 +98,6 @@ def open_scene(
         gravity=STANDARD_GRAVITY if gravity is None else gravity,
         most_force=MOST_FORCE if most_force is None else most_force, keep=keep,
     )  # fmt: skip
-
-
-def _untrained(scene: GaussianScene, fps: float) -> GausSim:
-    return _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
 
 
 def _of_base(scene: GaussianScene, fps: float, base: Path) -> GausSim:

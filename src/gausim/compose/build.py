@@ -26,9 +26,6 @@ from gausim.training.module import GausSimModule
 from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources
 
-# Target of the data of pretraining.
-PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
-
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
@@ -58,8 +55,12 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
             "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
             f"{sorted(str(k) for k in config.model)}."
         )
-    plan = instantiate(config.model.plan) if fits else None
-    datamodule = instantiate(config.data, **({} if plan is None else _staged(config, plan)))
+    plan, settings = None, {}
+    if fits:  # the plan sets T and the shows per epoch; sequences are fitted independently
+        plan = instantiate(config.model.plan)
+        curriculum = StagedCurriculum(t_start=1, t_max=int(config.data.curriculum.t_max), plan=plan)
+        settings = {"curriculum": curriculum, "repeats": plan.shows, "batch_size": config.data.batch_size or 1}
+    datamodule = instantiate(config.data, **settings)
     datamodule.sealed = sealed
     scenes = [item.scene() for item in datamodule.objects]
     given = {"scenes": scenes, "fps": [item.fps for item in datamodule.objects]}
@@ -84,13 +85,6 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         seed=int(config.seed),
     )
     return module, datamodule
-
-
-def _staged(config: DictConfig, plan: Any) -> dict[str, Any]:
-    """Settings of the data of a method that is fitted in stages; its plan sets T and the shows per epoch."""
-    curriculum = StagedCurriculum(t_start=1, t_max=int(config.data.curriculum.t_max), plan=plan)
-    alone = config.data.batch_size or 1  # sequences are fitted independently
-    return {"curriculum": curriculum, "repeats": plan.shows, "batch_size": alone}
 
 
 def _shared_simulator(config: DictConfig, model: Any, datamodule: ReadyDataModule) -> SharedSimulator:
@@ -123,7 +117,8 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
 
 def is_pretrained(run_dir: Path | str) -> bool:
     """Whether a run was trained on, or fitted to, bodies of a corpus."""
-    return bool(RunDirectory(run_dir).config().get("data", {}).get("_target_") == PRETRAINING)
+    target = RunDirectory(run_dir).config().get("data", {}).get("_target_")
+    return bool(target == "gausim.data.pretraining.CorpusDataModule")
 
 
 def load_corpus_run(

@@ -6,6 +6,7 @@ import difflib
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,6 @@ import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
-from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -139,11 +139,6 @@ def run_dir() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def in_sweep() -> bool:
-    """Returns whether the running job is one of a sweep (`-m`)."""
-    return bool(HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
-
-
 @contextmanager
 def _guarded() -> Iterator[None]:
     """Checks the node `hydra` of a configuration before Hydra builds its logging, callbacks and launcher from it."""
@@ -235,10 +230,8 @@ def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any
 
 def _is_wrong_call(error: TypeError) -> bool:
     """Whether the target does not take its arguments, as opposed to a TypeError raised in its body."""
-    frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
-        frame = frame.tb_next
-    raised_in = Path(frame.tb_frame.f_code.co_filename).resolve() if frame else Path()
+    frames = traceback.extract_tb(error.__traceback__)
+    raised_in = Path(frames[-1].filename).resolve() if frames else Path()
     hydra_home = Path(hydra.__file__).resolve().parent
     return "argument" in str(error) and (raised_in == Path(__file__).resolve() or hydra_home in raised_in.parents)
 

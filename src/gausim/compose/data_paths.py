@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gausim.core.errors import ConfigError, DataError
+from gausim.runs.names import CONFIG
 
-# Folder in a packed run for rest scenes from outside its data set.
-SCENES = "scenes"
-_KEYS = ("root", "scene", "masks")
+# Folder in a packed run for rest scenes from outside its data set; source of a directory that `gausim fetch` made.
+SCENES, FETCHED = "scenes", "FETCHED"
 _FILES = ("scene", "masks")
 
 
@@ -25,10 +25,10 @@ def data_option(words: Sequence[str]) -> dict[str, Any]:
     roots = []
     for word in words:
         key, _, value = word.partition("=")
-        if key not in _KEYS or not value:
-            roots.append(word)
-        elif key == "root":
+        if key == "root" and value:
             roots.append(value)
+        elif key not in _FILES or not value:
+            roots.append(word)
         elif key in given:
             raise ConfigError(f"--data {word}: {key} is given twice.")
         else:
@@ -78,7 +78,7 @@ def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
 
 def listed(root: Any) -> list[Any]:
     """The entries of ``data.root`` as a list, also if it is a single one."""
-    return list(root) if isinstance(root, list) else [root]
+    return root if isinstance(root, list) else [root]
 
 
 def _roots(own: Any, given: Any) -> Any:
@@ -107,8 +107,6 @@ def _placed(run_dir: Path, entry: Mapping[str, Any], field: str) -> dict[str, An
 
 
 def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> str:
-    from gausim.runs.directory import CONFIG
-
     fetched = _fetched_with(run_dir)
     first = f" `gausim fetch {fetched}` fetches the data set that it was trained on." if fetched else ""
     key, value = option.removeprefix("--data ").partition("=")[::2]
@@ -122,8 +120,6 @@ def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> st
 
 def _fetched_with(run_dir: Path) -> str | None:
     """Registry entry of the data set of a fetched run, if any."""
-    from gausim.runs.directory import FETCHED
-
     try:
         found = json.loads((run_dir / FETCHED).read_text())["data"]
     except (OSError, ValueError, KeyError, TypeError):

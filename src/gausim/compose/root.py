@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import MISSING, OmegaConf
 
 import gausim
+from gausim.core.errors import ConfigError
 
 HYDRA_VERSION_BASE = "1.3"
 LONGEST_FOLDER_NAME = 120
@@ -111,9 +112,14 @@ def folder_name(text: str) -> str:
     return f"{plain[: LONGEST_FOLDER_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
+def in_sweep() -> bool:
+    """Returns whether the running job is one of a sweep (`-m`)."""
+    return bool(HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
+
+
 def job_threads(most: int) -> int:
     """Returns the threads of one job: `most`, or fewer where a sweep divides the cores among parallel jobs."""
-    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+    if not in_sweep():
         return most
     launcher = HydraConfig.get().launcher
     if "cpus_per_task" in launcher:  # submitit: cores granted by the scheduler
@@ -143,10 +149,8 @@ def job_group(name: str) -> str:
 
 def job_name(seed: int) -> str:
     """Returns the name of a run within its group on dashboards: its seed, in a sweep after its overrides."""
-    hydra_config = HydraConfig.get() if HydraConfig.initialized() else None
-    sweeps = hydra_config is not None and hydra_config.mode == RunMode.MULTIRUN
-    overrides = folder_name(hydra_config.job.override_dirname) if hydra_config is not None and sweeps else ""
-    return "/".join([*([overrides] if overrides else []), f"seed_{seed}"])
+    overrides = folder_name(HydraConfig.get().job.override_dirname) if in_sweep() else ""
+    return f"{overrides}/seed_{seed}" if overrides else f"seed_{seed}"
 
 
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
@@ -165,8 +169,6 @@ def conf_dir() -> Path:
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
-    from gausim.core.errors import ConfigError  # loads torch, which would delay completions
-
     raise ConfigError(
         f"expected the configurations in {candidates[0]} or {candidates[1]}, found neither. Reinstall gausim, or run "
         "from a complete checkout."

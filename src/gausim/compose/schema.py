@@ -7,14 +7,14 @@ import inspect
 import pkgutil
 import re
 import types
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 from omegaconf import MISSING
 
 from gausim.compose.places import Place, choices, read_places
-from gausim.compose.root import ProtocolConfig, RootConfig, SweepConfig
+from gausim.compose.root import RootConfig
 
 Schema = dict[str, Any]
 
@@ -31,8 +31,6 @@ _SPECIAL: Schema = {
 _PLAIN = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", Path: "string"}
 # Keys with arbitrary content.
 _RECORDS = ("ablation", "experiment")
-# Root keys whose dataclass says everything.
-_PLAIN_NODES: dict[str, Any] = {"sweep": SweepConfig, "protocol": ProtocolConfig}
 # Mappings with arbitrary names, whose entries have targets.
 _NAMED = ("callbacks", "logger")
 
@@ -46,16 +44,17 @@ def training_schema() -> Schema:
     builder = _Builder()
     root, notes = read_places(), documented(RootConfig)
     properties: Schema = {"defaults": _defaults(), "hydra": {"type": "object"}}
+    names = vars(inspect.getmodule(RootConfig))
     for entry in fields(RootConfig):
-        if entry.name in _PLAIN_NODES:
-            node = _PLAIN_NODES[entry.name]
-            found = _closed({f.name: _leaf(_hint(f.type, vars(inspect.getmodule(node)))) for f in fields(node)})
+        hint = _hint(entry.type, names)
+        if is_dataclass(hint):  # it says everything
+            found = _closed({field.name: _leaf(_hint(field.type, names)) for field in fields(hint)})
         elif entry.name in _RECORDS:
             found = {"type": ["object", "null"]}
         elif entry.name in root.children and (root.children[entry.name].children or root.children[entry.name].targets):
             found = builder.place(entry.name, root.children[entry.name])
         else:
-            found = _leaf(_hint(entry.type, vars(inspect.getmodule(RootConfig))))
+            found = _leaf(hint)
         properties[entry.name] = _described(found, notes.get(entry.name, ""))
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",

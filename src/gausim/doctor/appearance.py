@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import median_filter
 
-from gausim.doctor.evidence import Evidence, Watched
-from gausim.doctor.finding import Finding, listed
+from gausim.doctor.evidence import Evidence, Finding, listed
 
 # Mean slope of the colours within the object below which it counts as plain [1/255 per reduced pixel].
 _PLAIN = 2.5
@@ -19,16 +18,12 @@ _FLICKER, _OFTEN, _BETWEEN = 0.03, 0.1, 0.15
 _OPAQUE, _INSIDE = 230, 3
 
 
-def _inside(alpha: np.ndarray) -> np.ndarray:
-    kernel = np.ones((2 * _INSIDE + 1, 2 * _INSIDE + 1), np.uint8)
-    return cv2.erode((alpha > _OPAQUE).astype(np.uint8), kernel) > 0
-
-
 def find_plain(evidence: Evidence) -> Iterator[Finding]:
     """Finds objects of nearly constant colour."""
     item, slopes = evidence.first[0], []
-    for v in range(len(evidence.views)):
-        inside, gray = _inside(item.alpha[0, v]), item.gray[0, v] * 255
+    kernel = np.ones((2 * _INSIDE + 1, 2 * _INSIDE + 1), np.uint8)
+    for alpha, gray in zip(item.alpha[0], item.gray[0] * 255, strict=True):
+        inside = cv2.erode((alpha > _OPAQUE).astype(np.uint8), kernel) > 0
         if inside.sum() > 20:
             slopes.append(float(np.hypot(*np.gradient(gray))[inside].mean()))
     if slopes and float(np.median(slopes)) < _PLAIN:
@@ -41,22 +36,16 @@ def find_plain(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _brightness(item: Watched, view: int) -> np.ndarray:
-    """Mean brightness of the opaque foreground per frame, (F,); NaN without any."""
-    opaque = item.alpha[:, view] > _OPAQUE
-    count = opaque.sum((-1, -2))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return (item.gray[:, view] * opaque).sum((-1, -2)) / np.where(count > 0, count, np.nan)
-
-
 def find_flicker(evidence: Evidence) -> Iterator[Finding]:
     """Finds brightness that jumps from frame to frame."""
     fractions: dict[str, float] = {}
     for v, view in enumerate(evidence.views):
         jumps = []
         for item in evidence.watched:
-            light = _brightness(item, v)
-            if len(light) > 4 and np.isfinite(light).all():
+            opaque = item.alpha[:, v] > _OPAQUE
+            count = opaque.sum((-1, -2))
+            if len(count) > 4 and count.all():
+                light = (item.gray[:, v] * opaque).sum((-1, -2)) / count  # mean over the foreground, per frame
                 jumps.append(np.abs(light / np.maximum(median_filter(light, 3, mode="nearest"), 1e-6) - 1) > _FLICKER)
         fractions[view] = float(np.concatenate(jumps).mean()) if jumps else 0.0
     flickers = [view for view, fraction in fractions.items() if fraction > _OFTEN]
@@ -70,7 +59,7 @@ def find_flicker(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def find_uneven_cameras(evidence: Evidence) -> Iterator[Finding]:
+def find_uneven(evidence: Evidence) -> Iterator[Finding]:
     """Finds brightness that differs from camera to camera."""
     if evidence.rest is None or evidence.fits is None:
         return

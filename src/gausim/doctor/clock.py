@@ -9,8 +9,8 @@ import numpy as np
 
 from gausim.core import Cameras
 from gausim.doctor.coverage import view_directions
-from gausim.doctor.evidence import Evidence, Watched
-from gausim.doctor.finding import Finding
+from gausim.doctor.evidence import Evidence, Finding, Watched
+from gausim.doctor.silhouettes import centres
 
 # Largest tested shift of a camera [frames].
 FURTHEST = 8
@@ -118,14 +118,10 @@ def _by_lag(own: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 def _middles(item: Watched) -> np.ndarray:
     """Centres of the masks, (F, V, 2) [reduced pixels]; that of the frame before for an empty mask."""
-    weights = item.alpha.astype(np.float64)
-    total = weights.sum((-1, -2))
-    rows, columns = np.indices(item.alpha.shape[-2:])
-    sums = np.stack(((weights * columns).sum((-1, -2)), (weights * rows).sum((-1, -2))), -1)
-    middles = sums / np.maximum(total, 1)[..., None]
-    for f in range(1, len(middles)):
-        middles[f] = np.where(total[f, :, None] > 0, middles[f], middles[f - 1])
-    return middles
+    found, shown = centres(item.alpha), item.alpha.max((-1, -2)) > 0
+    for f in range(1, len(found)):
+        found[f] = np.where(shown[f, :, None], found[f], found[f - 1])
+    return found
 
 
 def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:

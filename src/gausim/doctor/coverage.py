@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gausim.core import SceneError
-from gausim.doctor.evidence import Evidence
-from gausim.doctor.finding import Finding, listed
+from gausim.doctor.evidence import Evidence, Finding, listed
 from gausim.ops.selection import require_pinned
 from gausim.ops.visual_hull import search_cube
 

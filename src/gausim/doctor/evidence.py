@@ -1,9 +1,11 @@
-"""Input of the checks: some frames of some sequences, reduced, and the rest scene rendered in every camera."""
+"""Input of the checks, some reduced frames of some sequences and the rest scene in every camera, and their findings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -16,12 +18,35 @@ from gausim.data.records import SequenceRecord
 from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_silhouette
 from gausim.runs.bar import with_bar
 
+Severity = Literal["fault", "warning", "note"]
+Sureness = Literal["certain", "likely", "possible"]
+SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
+
 # Sequences whose motion is examined, and whose first frames are compared with the rest scene.
 WATCHED_SEQUENCES, FIRST_FRAMES = 4, 12
 # Examined frames of each, from frame 0 on, and the number decoded at a time.
 WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
 # Length of the longer side of reduced images [pixels].
 LONGEST = 192
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding."""
+
+    severity: Severity  # "fault" if it makes training useless, "warning" if it lowers the quality, else "note"
+    sureness: Sureness  # certainty of the finding
+    what: str  # the problem, in a sentence that names cameras, sequences and files
+    remedy: str  # what to do
+    measured: Mapping[str, Any] = field(default_factory=dict)  # measured values, for programs
+    check: str = ""  # the check that found it, which :func:`gausim.doctor.examine.examine` fills in
+
+
+def listed(names: list[str]) -> str:
+    """Names in a sentence: "a", "a and b", "a, b and c"; of more than six only the first five and a count."""
+    if len(names) > 6:
+        return f"{', '.join(names[:5])} and {len(names) - 5} more"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,31 +6,20 @@ from dataclasses import dataclass, replace
 
 from gausim.core import DataError, GaussianScene
 from gausim.data.objects import ObjectData
-from gausim.doctor.appearance import find_flicker, find_plain, find_uneven_cameras
-from gausim.doctor.calibration import find_calibration_faults
-from gausim.doctor.clock import find_clock_faults
-from gausim.doctor.coverage import (
-    find_cut_off,
-    find_few_frames,
-    find_few_sequences,
-    find_like_directions,
-    find_pins,
-    find_tiny,
-)
-from gausim.doctor.evidence import Evidence, gather, with_bar
-from gausim.doctor.finding import SEVERITIES, Check, Finding
-from gausim.doctor.masks import find_mask_faults
-from gausim.doctor.motion import find_odd_motion, find_unrest
+from gausim.doctor import appearance, calibration, clock, coverage, masks, motion
+from gausim.doctor.evidence import SEVERITIES, Evidence, Finding, gather
+from gausim.runs.bar import with_bar
 
+# Each check with the others whose faults invalidate it, and its finders, one per kind of fault.
 CHECKS = (
-    Check("pins", (find_pins,)),
-    Check("extent", (find_few_frames, find_few_sequences)),
-    Check("masks", (find_mask_faults,)),
-    Check("calibration", (find_calibration_faults,), needs=("masks",)),
-    Check("views", (find_like_directions, find_cut_off, find_tiny), needs=("masks", "calibration")),
-    Check("clock", (find_clock_faults,), needs=("masks",)),
-    Check("motion", (find_unrest, find_odd_motion), needs=("masks",)),
-    Check("appearance", (find_plain, find_flicker, find_uneven_cameras), needs=("masks", "calibration")),
+    ("pins", (), (coverage.find_pins,)),
+    ("extent", (), (coverage.find_few_frames, coverage.find_few_sequences)),
+    ("masks", (), (masks.find_mask_faults,)),
+    ("calibration", ("masks",), (calibration.find_calibration_faults,)),
+    ("views", ("masks", "calibration"), (coverage.find_like_directions, coverage.find_cut_off, coverage.find_tiny)),
+    ("clock", ("masks",), (clock.find_clock_faults,)),
+    ("motion", ("masks",), (motion.find_unrest, motion.find_odd_motion)),
+    ("appearance", ("masks", "calibration"), (appearance.find_plain, appearance.find_flicker, appearance.find_uneven)),
 )
 
 
@@ -61,23 +50,15 @@ def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
         remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
         return Examination((Finding("fault", "certain", str(error), remedy, check="files"),), {}, None)
     findings: list[Finding] = []
-    spoilt: set[str] = set()
     left_out: dict[str, str] = {}
-    for check in with_bar(CHECKS, "checks"):
-        blocking = next((name for name in check.needs if name in spoilt), None)
-        if blocking is not None:
-            left_out[check.name] = blocking
-            continue
-        found = [replace(finding, check=check.name) for finder in check.finders for finding in finder(evidence)]
-        findings += found
-        if any(finding.severity == "fault" for finding in found):
-            spoilt.add(check.name)
-    findings = _without_consequences(findings)
-    ordered = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
-    return Examination(tuple(ordered), left_out, evidence)
-
-
-def _without_consequences(findings: list[Finding]) -> list[Finding]:
-    """Removes findings that a camera disagrees with the rest scene if its clock is early, which explains them."""
+    for name, needs, finders in with_bar(CHECKS, "checks"):
+        spoilt = [finding.check for finding in findings if finding.severity == "fault" and finding.check in needs]
+        if spoilt:
+            left_out[name] = min(spoilt, key=needs.index)
+        else:
+            findings += [replace(finding, check=name) for find in finders for finding in find(evidence)]
+    # A camera whose clock is early disagrees with the rest scene, too; that is no finding of its own.
     early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
-    return [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]
+    kept = [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]
+    ordered = sorted(kept, key=lambda finding: SEVERITIES.index(finding.severity))
+    return Examination(tuple(ordered), left_out, evidence)

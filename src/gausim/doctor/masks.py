@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from gausim.doctor.evidence import Evidence
-from gausim.doctor.finding import Finding, listed
+from gausim.doctor.evidence import Evidence, Finding, listed
 from gausim.doctor.silhouettes import overlap
 
 # Fractions of foreground along the image border above which masks are inverted, and missing.

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from gausim.doctor.evidence import Evidence, Watched, same_cameras
-from gausim.doctor.finding import Finding, listed
+from gausim.doctor.evidence import Evidence, Finding, Watched, listed, same_cameras
 from gausim.doctor.silhouettes import overlap
 from gausim.metrics.oscillation import coordinates, principal_motions, spectrum
 

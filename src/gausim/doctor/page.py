@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 from jinja2 import Environment, StrictUndefined
 
+from gausim.doctor.evidence import SEVERITIES, listed
 from gausim.doctor.examine import Examination
-from gausim.doctor.finding import SEVERITIES, listed
 
 _WIDTH = 118
 

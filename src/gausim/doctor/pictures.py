@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from gausim.doctor.clock import motion_energy
-from gausim.doctor.evidence import Evidence, with_bar
+from gausim.doctor.evidence import Evidence
 from gausim.report.pictures.figures import METHOD_COLORS, literal, save_figure
+from gausim.runs.bar import with_bar
 
 _DPI = 110
 _COLUMNS = 3
@@ -21,15 +21,14 @@ _OUTLINE = "#f0962a"
 
 def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
     """Writes all pictures to a folder; returns name and caption of each."""
-    drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
+    for name, draw in with_bar((("views.png", _views), ("motion.png", _motion)), "pictures"):
+        save_figure(literal(draw(evidence)), out / name)
+    return [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
-         "camera that the file states. Both must lie on each other.", _views),
+         "camera that the file states. Both must lie on each other."),
         ("motion.png", "Change from frame to frame within the foreground, as a fraction of each camera's largest. "
-         "Onset and peaks must lie above each other in all cameras.", _motion),
+         "Onset and peaks must lie above each other in all cameras."),
     ]  # fmt: skip
-    for name, _, figure in with_bar(drawn, "pictures"):
-        save_figure(literal(figure(evidence)), out / name)
-    return [(name, caption) for name, caption, _ in drawn]
 
 
 def _views(evidence: Evidence) -> Figure:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from gausim.core import Cameras, GaussianScene
 from gausim.render.cpu import CpuRenderer
@@ -51,6 +51,14 @@ def overlap(a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"]) -> f
     return float(np.minimum(a, b).sum()) / union if union > 0 else 0.0
 
 
+def centres(masks: Shaped[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n 2"]:
+    """Columns and rows of the centres of soft masks [pixels]; 0 for an empty one."""
+    weights = masks.astype(np.float64)
+    rows, columns = np.indices(masks.shape[-2:])
+    sums = np.stack(((weights * columns).sum((-1, -2)), (weights * rows).sum((-1, -2))), -1)
+    return sums / np.maximum(weights.sum((-1, -2)), 1)[..., None]
+
+
 def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w"], focal: float) -> Fit:
     """Shift and rotation in the image that align a rendered silhouette with a mask (enhanced correlation).
 
@@ -59,9 +67,9 @@ def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w
     raw = overlap(mask, drawn)
     if mask.sum() < 1 or drawn.sum() < 1:
         return Fit(raw, raw, (math.nan, math.nan), 0.0, math.inf, math.inf)
-    middle = _middle(mask)
+    middle = centres(mask)
     warp = np.eye(2, 3, dtype=np.float32)
-    warp[:, 2] = _middle(drawn) - middle
+    warp[:, 2] = centres(drawn) - middle
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _PRECISION)
     try:
         _, found = cv2.findTransformECC(mask, drawn, warp.copy(), cv2.MOTION_EUCLIDEAN, stop, None, _SMOOTHING)  # type: ignore[call-overload]
@@ -78,9 +86,3 @@ def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w
     tilt = math.degrees(math.atan(float(np.hypot(*shift)) / focal))
     pixels = float(np.sqrt((away**2).sum(0).mean()))
     return Fit(raw, overlap(mask, moved), (float(shift[0]), float(shift[1])), turn, pixels, math.hypot(tilt, turn))
-
-
-def _middle(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
-    total = mask.sum(dtype=np.float64)
-    rows, columns = np.indices(mask.shape)
-    return np.array([(columns * mask).sum(), (rows * mask).sum()], np.float64) / total

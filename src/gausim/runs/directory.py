@@ -29,7 +29,6 @@ from gausim.runs.renamed import with_present_names
 
 LOCK, EVENTS = ".lock", "events.jsonl"
 GRANTED = "granted more"  # event: the run was granted further epochs and minutes
-FETCHED = "FETCHED"  # source of a directory made by `gausim fetch`
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # Keys that may differ when a run is resumed: paths, display and hardware, which do not change the learned weights.
 FREE_KEYS = (

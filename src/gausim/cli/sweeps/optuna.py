@@ -111,15 +111,6 @@ class Search:
         own = spelled([f"{key}={value}" for key, value in (self._settings.params or {}).items()])
         return {override.get_key_element(): override for override in parser.parse_overrides([*own, *arguments])}
 
-    def _launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
-        """Starts jobs, waits for them, and returns their results."""
-        for overrides in jobs:  # check all first: a misspelt value must not fail after hours
-            self._context.config_loader.load_sweep_config(self._config, list(overrides))
-        with launching(self._folder):
-            results = [result_of(one) for one in self._launcher.launch(jobs, initial_job_idx=len(self._results))]
-        self._results += results
-        return results
-
     def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
         """The study, new or continued; a study with other parameters under the same name is refused."""
         wanted = self._settings
@@ -186,7 +177,11 @@ class Search:
         for trial in batch:  # trials with equal values are one job
             jobs.setdefault(tuple(f"{k}={_text(v)}" for k, v in trial.params.items()), []).append(trial)
         orders = [[*fixed, *values, f"hydra.sweeper.trial={same[0].number}"] for values, same in jobs.items()]
-        results = self._launch(orders)
+        for order in orders:  # check all first: a misspelt value must not fail after hours
+            self._context.config_loader.load_sweep_config(self._config, order)
+        with launching(self._folder):
+            results = [result_of(one) for one in self._launcher.launch(orders, initial_job_idx=len(self._results))]
+        self._results += results
         for (values, same), result in zip(jobs.items(), results, strict=True):
             for trial in same:
                 _tell(study, trial, result)
