@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.simulators import SMALLEST, silence
+from helpers.toy_runs import Trainings
 from helpers.toy_runs import rows as rows_of
 
 from gausim.cli import train as command
@@ -16,6 +17,7 @@ from gausim.compose.build import load_run
 from gausim.core import RunError
 from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.callbacks.convergence import Convergence, forecast, verdict
+from gausim.training.rollout import States
 
 TINY = (
     *SMALLEST, "model=gausim_paper", "data.curriculum.t_max=3", "data.repeats=2", "trainer.accelerator=cpu",
@@ -100,6 +102,25 @@ def test_the_forecast_is_one_for_a_still_object_and_none_for_the_truth(toy_run: 
         object.__setattr__(sample, "frames", own[:1].expand_as(own))
     module.baselines._known.clear()
     assert forecast(module, samples, 2).moving == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_forecast_moves_what_a_hand_holds(trainings: Trainings, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = load_run(
+        trainings.whole("held_briefly", trainings.moving("held"), "model=gausim_paper", "trainer.max_epochs=1")
+    )
+    module, sample, seen = run.module, run.datamodule.training_sample(0, 3), list[torch.Tensor]()
+
+    def compare(states: States, start: int) -> tuple[torch.Tensor, torch.Tensor]:
+        seen.append(states.positions)
+        return torch.zeros(len(states.positions), 1), torch.zeros(())
+
+    monkeypatch.setattr(module.supervision, "comparison", lambda samples, batch: compare)
+    forecast(module, [sample], 2)
+    scene = module.simulator.scenes[0]
+    held = scene.pinned & (scene.hand == 0)
+    moved = seen[0][-1] - scene.means
+    way = 3 * 0.03 * torch.tensor([1.0, 0.0, 0.5])  # of the hand in three frames
+    torch.testing.assert_close(moved[held], way.expand(int(held.sum()), 3), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -173,16 +173,15 @@ def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: in
     try:
         with evaluating(module):
             for sample in samples:
-                batch = module.simulator.batch([sample.scene_id])
-                _, made = next(
-                    windows(module.simulator, batch, module.method.initial([sample], batch), sample.steps, sample.steps)
-                )
+                batch, hands, steps = module.simulator.batch([sample.scene_id]), module.hands([sample]), sample.steps
+                initial = module.method.initial([sample], batch)
+                _, made = next(windows(module.simulator, batch, initial, steps, steps, hands=hands))
                 losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
                 baseline = module.baseline(sample)
-                still = sum(baseline.static[first : sample.steps])
+                still = sum(baseline.static[first:steps])
                 own = float(losses.sum())
                 loss += own if math.isfinite(own) else 10.0 * still
-                static, floor = static + still, floor + baseline.floor * (sample.steps - first)
+                static, floor = static + still, floor + baseline.floor * (steps - first)
     except DivergenceError:
         return Forecast(10.0, 1.0)
     return Forecast(excess(loss, static, floor), (static - floor) / max(static, 1e-12))
