@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import runpy
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.fake_wandb import fake_wandb
 from helpers.joint_runs import PAPER, weights
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -16,42 +16,46 @@ from gausim.cli import train as command
 from gausim.training.callbacks import panels
 from gausim.training.module import GausSimModule
 
-FakeWandb = runpy.run_path(str(Path(__file__).parents[1] / "training" / "test_dashboards.py"))["FakeWandb"]
 TINY = [word for word in PAPER if not word.startswith(("callbacks.panels", "logger"))]
 SHOWN = "callbacks.panels.every_epochs=1"
 
 
 @pytest.fixture
-def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def fake(monkeypatch: pytest.MonkeyPatch) -> Any:
+    return fake_wandb(monkeypatch)
+
+
+@pytest.fixture
+def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: Any) -> list[str]:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "wandb", FakeWandb)
-    FakeWandb.runs.clear()
     return [f"data.root={toy}", *TINY, "trainer.log_every_n_steps=1"]
 
 
 @pytest.mark.slow
-def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None:
+def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str], fake: Any) -> None:
     swept = [SHOWN, "logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3"]
     assert command.main(["-m", *arguments, *swept]) == 0
-    given = [run.given for run in FakeWandb.runs]
+    given = [run.given for run in fake.runs]
     assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/no_momentum/gausim_paper"] * 2
     assert len({g["name"] for g in given[:2]}) == 2 and all(g["name"].endswith("/seed_3") for g in given)
-    assert [run.exits for run in FakeWandb.runs] == [[0]] * 4
+    assert [run.exits for run in fake.runs] == [[0]] * 4
     assert given[2]["config"]["model"]["simulator"]["conserve_momentum"] is False
     assert len({g["id"] for g in given}) == 4
-    names = {name for _, row in FakeWandb.runs[0].rows for name in row}
+    names = {name for _, row in fake.runs[0].rows for name in row}
     assert {"train/grad_network", "train/steps", "epoch/loss_image", "objects/toy/l2", "media/objects"} <= names
     assert "media/toy_seq_000/video" in names
 
 
-def test_a_job_that_fails_ends_its_run_as_failed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_that_fails_ends_its_run_as_failed(
+    arguments: list[str], fake: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(self: GausSimModule) -> None:
         raise MemoryError("out of memory")
 
     monkeypatch.setattr(GausSimModule, "on_train_epoch_end", fail)
     with pytest.raises(MemoryError):
         command.main([*arguments, "callbacks.panels=null", "logger=wandb"])
-    (run,) = FakeWandb.runs
+    (run,) = fake.runs
     assert run.exits == [1] and run.given["name"] == "seed_0" and run.given["group"] == "toy/none/gausim_paper"
 
 

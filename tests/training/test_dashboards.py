@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
 import pytest
+from helpers.fake_wandb import fake_wandb
 from helpers.offline_run import read_offline_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -117,36 +116,9 @@ def test_tensorboard_has_video_pictures_errors_table_and_config(tmp_path: Path) 
     assert [e.step for e in resumed.Images(f"{NAME}/video")] == [8]
 
 
-class FakeRun:
-    def __init__(self, given: dict[str, Any], start: int) -> None:
-        self.given, self.starting_step = given, start
-        self.rows: list[tuple[int, dict[str, Any]]] = []
-        self.exits: list[int] = []
-
-    def log(self, values: dict[str, Any], step: int | None = None, commit: bool | None = None) -> None:
-        assert not self.exits, "logged after its end"
-        if values:
-            assert step is not None and (not self.rows or step >= self.rows[-1][0]), "steps must not go back"
-            self.rows.append((step, values))
-        np.random.rand()  # a library may draw; training must not notice
-
-    def finish(self, exit_code: int) -> None:
-        self.exits.append(exit_code)
-
-
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """wandb with a server that has steps before ``start``, and the runs that it was asked for."""
-    module = MagicMock(runs=[], start=0, Error=type("Error", (Exception,), {}))
-
-    def init(**given: Any) -> FakeRun:
-        np.random.rand()
-        module.runs.append(FakeRun(given, module.start))
-        return module.runs[-1]
-
-    module.init.side_effect = init
-    monkeypatch.setitem(sys.modules, "wandb", module)
-    return module
+    return fake_wandb(monkeypatch)
 
 
 def train_a_part(run: Path, resume_at: int, steps: range, *, offline: bool = True, status: str = "success") -> None:
