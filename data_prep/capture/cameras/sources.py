@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 
 from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, list_images, natural, open_photo
@@ -318,11 +317,13 @@ def factors(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         DataError: the file holds anything else than twelve numbers, or they are no camera's.
     """
+    from scipy.linalg import rq  # slow to import
+
     matrix = _read_matrix(path)
     p = matrix * np.sign(np.linalg.det(matrix[:, :3]))
     if not np.linalg.cond(p[:, :3]) < 1e9:
         raise DataError(f"{path}: the matrix is singular; expected K [R | t] of a camera.")
-    k, rotation = scipy.linalg.rq(p[:, :3])
+    k, rotation = rq(p[:, :3])
     signs = np.sign(np.diag(k))
     k, viewmat = k * signs, np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = signs[:, None] * rotation, np.linalg.solve(k, p[:, 3])

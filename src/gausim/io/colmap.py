@@ -13,7 +13,6 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gausim.core.errors import DataError
 
@@ -188,6 +187,8 @@ def _checked_camera(where: str, camera: ColmapCamera) -> ColmapCamera:
 
 
 def _checked_image(where: str, pose: np.ndarray, image: ColmapImage, cameras: dict[int, ColmapCamera]) -> ColmapImage:
+    from scipy.spatial.transform import Rotation  # a fifth of a second, which --help of the stages need not take
+
     place = PurePosixPath(image.name)
     if not image.name.isprintable() or not place.name or place.is_absolute() or ".." in place.parts:
         raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {image.name!r:.80}.")
