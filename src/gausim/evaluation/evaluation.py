@@ -100,8 +100,8 @@ def evaluate_object(
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
+    records = _chosen(data, sequences)  # before the measure, which reads the true motion of all
     measure = _ObjectMeasure(data, scene, methods, renderer, views)
-    records = _chosen(data, sequences)
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:

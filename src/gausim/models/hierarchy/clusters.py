@@ -86,8 +86,8 @@ def build_hierarchy(
     pinned = scene.pinned.cpu()[index]
     # Kernels that move together: the free ones, and those of each hand.
     group = torch.where(pinned, 1, 0) if scene.hand is None else torch.where(pinned, scene.hand.cpu()[index] + 2, 0)
-    central = (rest - rest.mean(0)).norm(dim=1).argmin()[None]  # the root of a body that nothing holds
-    roots = (pinned.nonzero()[:, 0] if pinned.any() else central).numpy()
+    # The root of a body that nothing holds is the kernel nearest to the mean.
+    roots = (pinned.nonzero()[:, 0] if pinned.any() else (rest - rest.mean(0)).norm(dim=1).argmin()[None]).numpy()
     diagonal = scene.diagonal if axes is None else float(np.linalg.norm(np.ptp(rest.numpy() @ axes.T, axis=0)))
     tree = cKDTree(rest[roots].numpy())
     levels = []

@@ -166,9 +166,7 @@ class HeldMotion(Carried):
         slope = torch.stack(slopes).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
         load = torch.cat((pull, slope.flatten(1)), 1)
         floor = None if body.contact is None else body.contact.nearness(now, present[1])
-        shown, shown_before = (
-            body.units + (x - place) @ axes for x, (place, axes, *_) in ((now, present), (before, last))
-        )
+        shown, shown_before = body.units + (now - present[0]) @ present[1], body.units + (before - last[0]) @ last[1]
         super().__init__(UnitMotion(shown, shown_before, load, floor))
 
     def place(self, made: Placed) -> Placed:
