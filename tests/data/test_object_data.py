@@ -83,10 +83,17 @@ def test_wrong_hands_are_refused(spoilt: Path, changed: dict[str, object], messa
         _ = ObjectData(spoilt).sequences
 
 
-def test_a_hand_that_holds_nothing_is_refused(spoilt: Path) -> None:
-    _hold(spoilt, points=np.full((FRAMES, 2, 3), 99.0))
-    surround(spoilt, grip=0.1)
-    with pytest.raises(DataError, match="'grip' is 0.1: hand 0 holds none"):
+@pytest.mark.parametrize(
+    ("away", "grip", "message"),
+    [(99.0, 0.1, "'grip' is 0.1: hand 0 holds none"), (0.0, 1e9, "no simulated kernel is left outside the hands")],
+)
+def test_hands_that_hold_nothing_or_everything_are_refused(
+    spoilt: Path, away: float, grip: float, message: str
+) -> None:
+    means = ObjectData(spoilt).scene().means.numpy()
+    _hold(spoilt, points=np.repeat(means[[0, -1]][None], FRAMES, 0) + away)
+    surround(spoilt, grip=grip)
+    with pytest.raises(DataError, match=rf"dataset\.json: .*{message}"):
         ObjectData(spoilt).scene()
 
 

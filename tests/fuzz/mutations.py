@@ -83,7 +83,7 @@ def _json(data: bytes, rng: random.Random) -> bytes:
     elif way == 6:
         other, place = rng.choice(places)
         holder[key] = json.loads(json.dumps(other[place]))
-    elif way == 7 and isinstance(holder[key], int | float):
+    elif way == 7 and isinstance(holder[key], int | float) and abs(holder[key]) < 1e300:  # or no float holds it
         holder[key] = -holder[key] if rng.random() < 0.5 else holder[key] * rng.choice((0, 1.5, 1e6, 1e30))
     else:
         holder[key] = rng.choice(VALUES)

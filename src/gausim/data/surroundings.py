@@ -83,7 +83,7 @@ def gripped(
     """The scene with its hands: kernels within ``reach`` of a hand's point (C, 3) are pinned to that hand.
 
     Raises:
-        DataError: a hand holds no kernel.
+        DataError: a hand holds no kernel, or none is left that moves by itself.
     """
     distance, nearest = cKDTree(points.numpy()).query(scene.means.cpu().numpy())
     near = torch.from_numpy(distance <= (reach or 0.0)).to(scene.pinned.device) & scene.simulated
@@ -96,4 +96,10 @@ def gripped(
             f"{int(scene.simulated.sum())} simulated kernels. Raise it to the distance [scene units] from the "
             "hands' points to the object."
         )
-    return replace(scene, pinned=scene.pinned | near, hand=held)
+    pinned = scene.pinned | near
+    if not (scene.simulated & ~pinned).any():
+        raise DataError(
+            f"{where}: field 'grip' is {reach}: no simulated kernel is left outside the hands. Lower it to the "
+            "distance [scene units] within which the hands' points hold the object."
+        )
+    return replace(scene, pinned=pinned, hand=held)
