@@ -114,6 +114,14 @@ def test_stills_are_split(blob: Path) -> None:
     assert torch.equal(read_stills(blob / "static" / "transforms.json").images, stills.images)
 
 
+@pytest.mark.parametrize("place", ["static", "sequences/seq_000"])
+def test_images_too_large_for_memory_are_refused(spoilt: Path, place: str) -> None:
+    path = spoilt / place / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"w": 1 << 62}))
+    with pytest.raises(DataError, match=rf"{place}/transforms\.json: \d+ images of {1 << 62}x6 do not fit into memory"):
+        _ = ObjectData(spoilt).stills() if place == "static" else ObjectData(spoilt).sequences[0]
+
+
 def test_sequences_can_be_limited(blob: Path) -> None:
     assert [s.name for s in ObjectData(blob, sequences=2).sequences] == ["seq_000", "seq_001"]
     assert [s.name for s in ObjectData(blob, sequences=["seq_002"]).sequences] == ["seq_002"]

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
-from gausim.data.images import read_rgba_into
+from gausim.data.images import read_rgba_into, room_for
 from gausim.io.packed import HEADER, is_packed, read_packed
 from gausim.io.transforms import PosedFrame, read_transforms
 
@@ -85,8 +85,7 @@ class ImageSource:
         _check_static(posed.path, posed.cameras, index, views)
         chosen = posed.cameras.select([row[0] for row in index])
         self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, tuple(views))
-        # np.empty uses no physical memory before a frame is decoded into it.
-        self._pixels = np.empty((self.count, len(views), chosen.height, chosen.width, 4), np.uint8)
+        self._pixels = room_for((self.count, len(views)), chosen, posed.path)
         self._decoded = np.zeros((self.count, len(views)), bool)
 
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gausim.core import DataError
+from gausim.core import Cameras, DataError
 from gausim.io.pixels import decode, read_header
 
 # Decoding releases the interpreter lock; more threads than this only wait for the disk.
@@ -75,6 +76,21 @@ def _film_hint(path: Path) -> str:
         ": it is a film or a photo in a film's container (MP4, MOV, HEIC). Frames are PNG files with alpha; "
         "`gausim prepare ingest` makes them of films, `gausim prepare segment` cuts the object out"
     )
+
+
+def room_for(count: tuple[int, ...], cameras: Cameras, where: Path) -> UInt8[np.ndarray, "*count H W 4"]:
+    """Unfilled RGBA images of these cameras; they take no physical memory before they are decoded into.
+
+    Raises:
+        DataError: there is no memory for so many of this size, which ``where`` states.
+    """
+    try:
+        return np.empty((*count, cameras.height, cameras.width, 4), np.uint8)
+    except (ValueError, MemoryError) as error:
+        raise DataError(
+            f"{where}: {math.prod(count)} images of {cameras.width}x{cameras.height} do not fit into memory. "
+            "Check its fields 'w' and 'h', or export smaller images."
+        ) from error
 
 
 def read_rgba_into(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError, HandPath
 from gausim.data.frames import open_frames
-from gausim.data.images import read_rgba_into
+from gausim.data.images import read_rgba_into, room_for
 from gausim.data.surroundings import read_hands
 from gausim.io.npz import read_array
 from gausim.io.transforms import read_transforms
@@ -51,7 +51,7 @@ def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = F
     """
     posed = read_transforms(path)
     cameras = posed.cameras
-    images = np.empty((len(posed.frames), cameras.height, cameras.width, 4), np.uint8)
+    images = room_for((len(posed.frames),), cameras, path)
     read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height), opaque=opaque)
     heldout = tuple(range(every - 1, len(images), every))
     train = tuple(sorted(set(range(len(images))) - set(heldout)))
