@@ -12,13 +12,13 @@ import torch
 from helpers.bodies import NEURAL, make_model, make_scene, make_state, neural_model
 from helpers.simulators import silence
 
-from gausim.core import Adjustable, SimState
+from gausim.core import Adjustable, ConfigError, SimState
 from gausim.evaluation.stability import _LinearStep, largest_eigenvalue
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.template.body_modes import CURVED
-from gausim.models.template.material import Links, MaterialTemplate, PreparedMaterial
+from gausim.models.template.material import Damping, Links, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import SolidBody, solid_body
 from gausim.ops.rotation import quaternion_to_matrix
 
@@ -62,13 +62,14 @@ def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
     assert not body.modes[level.pinned].any()
 
 
-def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
-    """Against the equations of the module's text, written out unit by unit."""
-    template, (density, attributes) = _template(hierarchy), _material(hierarchy)
+@pytest.mark.parametrize("c0", [0.02, 0.0])
+def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
+    """Against the equations of the module's text, written out unit by unit; with and without drag."""
+    template, (density, attributes) = _template(hierarchy, damping=Damping(c0, 0.02)), _material(hierarchy)
     body = template.body(0)
     units, links = template.decode(body, attributes)
     found = template.matrices(0, density, attributes, 1 / 24)
-    k, c0, c1 = (2 * np.pi / 8) ** 2, 0.02, 0.02
+    k, c1 = (2 * np.pi / 8) ** 2, 0.02
     rho = (2.5 * torch.tanh(density / 2.5)).exp()
     lost = torch.tanh(c0 * units[:, 2].exp() / 2)
     stiffness, inertia, drag = (torch.zeros(9, 9, dtype=torch.float64) for _ in range(3))
@@ -95,6 +96,24 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
     torch.testing.assert_close(found.units, k * units[:, :2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
+
+
+def test_without_drag_training_adds_none(hierarchy) -> None:
+    template, (density, attributes) = _template(hierarchy, damping=Damping(0.0, 0.02)), _material(hierarchy)
+    template.requires_grad_(True)
+    attributes.requires_grad_(True)
+    template.matrices(0, density, attributes, 1 / 24).damping.sum().backward()
+    slopes = [attributes.grad, *(p.grad for p in template.parameters() if p.grad is not None)]
+    assert all(torch.isfinite(slope).all() for slope in slopes)
+    assert template.damping.grad[0] == 0 != template.damping.grad[1]
+    with pytest.raises(ConfigError, match=r"damping.drag is 0"):
+        _ = template.log_drag
+
+
+@pytest.mark.parametrize("wrong", [Damping(-0.1, 0.1), Damping(0.1, 0.0)])
+def test_wrong_damping_is_refused(hierarchy, wrong: Damping) -> None:
+    with pytest.raises(ConfigError, match=r"template.damping: .* drag >= 0 and viscosity > 0"):
+        _template(hierarchy, damping=wrong)
 
 
 @pytest.mark.parametrize("finite", [True, False])

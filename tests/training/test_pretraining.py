@@ -189,7 +189,7 @@ def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus:
     torch.manual_seed(0)
     module, data = pretraining(corpus, "experiment=pretrain_fit", "init_from=RUN", "data.seen=8")
     model, body = module.model, data.objects[0].body
-    candidates = [float(STIFFNESS[8]), float(DRAG[5]) - model.template.start[1]]
+    candidates = [float(STIFFNESS[8]), float(DRAG[5]) - model.template.log_drag]
     with torch.no_grad():  # a material that is nearest to these candidates, of both numbers
         model.attributes[0][:, :2] = torch.tensor(candidates) + torch.tensor([0.1, 0.2])
     moved = SceneDynamics(model, 0).rollout(SimState(body.positions[0, 1], body.positions[0, 0]), FRAMES - 2).positions

@@ -47,7 +47,7 @@ def _scan(model: GausSim, scene_id: int, z: Float[Tensor, "S F M"]) -> None:
     """Sets attributes 0 and 1 of a body to the even material that explains its seen frames best."""
     attributes, steps = model.attributes[scene_id].data, min(STEPS, z.shape[1] - 2)
     motion = known_motion(z, torch.arange(1, z.shape[1] - steps, APART), steps)
-    candidates = STIFFNESS, DRAG - cast(MaterialTemplate, model.template).start[1]
+    candidates = STIFFNESS, DRAG - cast(MaterialTemplate, model.template).log_drag
     unchanged, turn = 0, 0
     while unchanged < len(candidates) and turn < MOST_TURNS:
         number, errors = turn % len(candidates), []

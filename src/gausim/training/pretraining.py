@@ -102,7 +102,7 @@ def _give(
     attributes = model.attributes[scene_id].zero_()
     model.log_density[scene_id].copy_(density.log())
     attributes[:, 0] = stiffness.log()
-    attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.start[1]))).clamp_min(LEAST_DAMPING).log()
+    attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.log_drag))).clamp_min(LEAST_DAMPING).log()
     batch = model.batch((scene_id,))
     for _ in range(ROUNDS):
         unit = fixed_units(batch, model.masses(batch)[0], attributes)[1][-1]

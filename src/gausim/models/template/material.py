@@ -75,6 +75,14 @@ class Links:
     damping: float = 0.0  # resistance to the growth of length or strain over that to it [frames at 24 per second]
 
 
+@dataclass(frozen=True)
+class Damping:
+    """Damping at the beginning."""
+
+    drag: float  # c_0 [1 / frame]; 0: none, whatever is trained
+    viscosity: float  # c_1 [frames]
+
+
 @dataclass(frozen=True, eq=False)
 class Matrices:
     """Matrices of the dynamics of one scene [frame units]."""
@@ -112,7 +120,7 @@ class MaterialTemplate(Template):
         finite_strain: bool = False,
         hidden: int = 48,
         period: float = 8.0,
-        damping: float = 0.02,
+        damping: Damping | float = 0.02,
         conserve_volume: bool = True,
     ) -> None:
         """Builds the scenes and the decoders; for the equations see the module's docstring.
@@ -128,11 +136,11 @@ class MaterialTemplate(Template):
             finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
-            damping: initial c_0 and c_1 [1 / frame, frames].
+            damping: initial c_0 and c_1; a number stands for both [1 / frame, frames].
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
-            ConfigError: fewer than two attributes.
+            ConfigError: fewer than two attributes, or a damping that is negative.
         """
         super().__init__()
         if attributes < 2:
@@ -147,10 +155,27 @@ class MaterialTemplate(Template):
         self.bodies = nn.ModuleList(
             made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )
-        self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
+        damping = Damping(damping, damping) if isinstance(damping, int | float) else damping
+        if damping.drag < 0 or damping.viscosity <= 0:
+            raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
+        self.log_k = 2 * math.log(2 * math.pi / period)
+        logs = [math.log(damping.drag) if damping.drag else -math.inf, math.log(damping.viscosity)]
+        self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
+
+    @property
+    def log_drag(self) -> float:
+        """Logarithm of c_0 at the beginning, to which the second attribute is relative [1 / frame].
+
+        Raises:
+            ConfigError: there is no drag.
+        """
+        found = float(cast(Tensor, self.log_damping)[0])
+        if math.isinf(found):
+            raise ConfigError("model.simulator.template.damping.drag is 0: no attribute can set the damping of a body.")
+        return found
 
     def body(self, scene_id: int) -> BodyModes:
         """Modes of one scene."""
@@ -173,14 +198,18 @@ class MaterialTemplate(Template):
         between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
         return own + _saturated(units), between + _saturated(links)
 
+    def _damping(self) -> Float[Tensor, " 2"]:
+        """c_0 and c_1 [1 / frame, frames]."""
+        return (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float | Tensor
     ) -> Matrices:
         """K, M and D of one scene from the densities and attributes of its units; ``dt`` is the frame interval [s]."""
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
         units, links = self.decode(body, attributes)
-        k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
-        drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
+        k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
+        drag, viscosity = self._damping()
         springs = self.links.springs * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         cells = units[:, :2].exp()
@@ -220,7 +249,7 @@ class MaterialTemplate(Template):
         for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
             homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.links.springs) * size)
-        drag = REFERENCE_FPS * (self.start[1] + DAMPING_GAIN * self.damping[0]).exp()
+        drag = REFERENCE_FPS * self._damping()[0]
         return {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
             "damping": Property(drag * decoded[:, 2].exp(), "drag over momentum [1/s]"),
@@ -243,7 +272,7 @@ class MaterialTemplate(Template):
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
             matrices = self.matrices(scene_id, density, attributes, batch.levels[-1].dt.index_select(0, rows[:1])[0, 0])
-            return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.start[0]))
+            return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.log_k))
 
         return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
