@@ -166,16 +166,20 @@ class MaterialTemplate(Template):
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
 
     @property
+    def has_drag(self) -> bool:
+        """Whether c_0 is not 0."""
+        return bool(torch.isfinite(cast(Tensor, self.log_damping)[0]))
+
+    @property
     def log_drag(self) -> float:
         """Logarithm of c_0 at the beginning, to which the second attribute is relative [1 / frame].
 
         Raises:
             ConfigError: there is no drag.
         """
-        found = float(cast(Tensor, self.log_damping)[0])
-        if math.isinf(found):
+        if not self.has_drag:
             raise ConfigError("model.simulator.template.damping.drag is 0: no attribute can set the damping of a body.")
-        return found
+        return float(cast(Tensor, self.log_damping)[0])
 
     def body(self, scene_id: int) -> BodyModes:
         """Modes of one scene."""
@@ -235,7 +239,7 @@ class MaterialTemplate(Template):
         )  # fmt: skip
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
-        """Stiffness, damping and density of the units as they enter K, D and M.
+        """Stiffness, density and, where there is drag, damping of the units as they enter K, M and D.
 
         Stiffness is the unit's part of the trace of K (half of each of its links) over the same part of the homogeneous
         body that k stands for; damping is the drag c_0 e^{d_i}.
@@ -249,12 +253,14 @@ class MaterialTemplate(Template):
         for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
             homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.links.springs) * size)
-        drag = REFERENCE_FPS * self._damping()[0]
-        return {
+        found = {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
-            "damping": Property(drag * decoded[:, 2].exp(), "drag over momentum [1/s]"),
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
+        if self.has_drag:
+            drag = REFERENCE_FPS * self._damping()[0] * decoded[:, 2].exp()
+            found["damping"] = Property(drag, "drag over momentum [1/s]")
+        return found
 
     @torch.no_grad()
     def slowest_period(
