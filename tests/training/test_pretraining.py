@@ -102,7 +102,9 @@ def base(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path, base: Path, tmp_path: Path) -> None:
+def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(
+    corpus: Path, base: Path, tmp_path: Path, capsys
+) -> None:
     _, data = pretraining(corpus)
     body = data.objects[0].scene()
     periods = {}
@@ -131,9 +133,11 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path
     scene, out = tmp_path / "beam.ply", tmp_path / "out"
     save_scene(body, scene)
     common = ["--scene", str(scene), "--from", str(base), "--pin-below", "z=0.01", "--out", str(out), "--frames", "5"]
-    assert simulate.main([*common, "--impulse", "on=tip", "weight_seconds=0.1", "direction=y"]) == 0
+    assert simulate.main([*common, "--impulse", "on=tip", "weight_seconds=0.1", "direction=y", "--verbose"]) == 0
     names = {"trajectory.safetensors", "session.json", "azimuth_0.mp4", "azimuth_0_sheet.png"}
     assert {p.name for p in out.iterdir()} == names
+    told = capsys.readouterr().out
+    assert all(f"wrote {out / name}\n" in told for name in names)
     moved = load_trajectory(out / "trajectory.safetensors").positions
     assert float(moved.diff(dim=0)[..., 1].abs().max()) > 1e-3
     for wrong, message in (

@@ -78,9 +78,8 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
             for view in views:
                 _write_view(run, item, record, trajectory, view, arguments, folder / name)
                 advance(f"{name} {view}")
-    if arguments.verbose:
-        for name in names:
-            print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+    for name in names:
+        _list(folder / name, arguments)
     of = names[0] if len(names) == 1 else f"{len(names)} sequences"
     return error_sentences({f"{item.data.name} {of}": summarise(curves)})[0]
 
@@ -143,8 +142,7 @@ def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -
     for view in views:
         cameras = _sharp(item.data.sequences[0].cameras_of([view]))
         write_film(run.renderer, interaction.scene, trajectory, arrows, cameras, arguments, folder)
-    if arguments.verbose:
-        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    _list(folder, arguments)
     replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
     end(told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
     return 0
@@ -181,8 +179,15 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     renderer = instantiate(compose("render/auto").render)
     write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
+    _list(folder, arguments)
     end(told(interaction, trajectory), "videos", folder)
     return 0
+
+
+def _list(folder: Path, arguments: argparse.Namespace) -> None:
+    """Prints what was written, where ``--verbose`` asks for it."""
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
 
 
 def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
