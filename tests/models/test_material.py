@@ -112,6 +112,15 @@ def test_without_drag_training_adds_none(hierarchy) -> None:
         _ = template.log_drag
 
 
+@pytest.mark.parametrize("trained", [True, False])
+def test_damping_is_trained_or_stays(hierarchy, trained: bool) -> None:
+    template, material = _template(hierarchy, damping=Damping(0.02, 0.02, trained)), _material(hierarchy)
+    made = NEURAL["template"]([hierarchy], 1, attributes=3, frames=[np.eye(3)], damping=Damping(0.02, 0.02, trained))
+    assert made.damping.requires_grad is trained and made.stiffness.requires_grad
+    known = _template(hierarchy).matrices(0, *material, 1 / 24).damping
+    torch.testing.assert_close(template.matrices(0, *material, 1 / 24).damping, known)
+
+
 @pytest.mark.parametrize("wrong", [Damping(-0.1, 0.1), Damping(0.1, 0.0)])
 def test_wrong_damping_is_refused(hierarchy, wrong: Damping) -> None:
     with pytest.raises(ConfigError, match=r"template.damping: .* drag >= 0 and viscosity > 0"):

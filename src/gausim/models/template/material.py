@@ -81,6 +81,7 @@ class Damping:
 
     drag: float  # c_0 [1 / frame]; 0: none, whatever is trained
     viscosity: float  # c_1 [frames]
+    trained: bool = True  # both; else they stay as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,8 @@ class MaterialTemplate(Template):
         self.log_k = 2 * math.log(2 * math.pi / period)
         logs = [math.log(damping.drag) if damping.drag else -math.inf, math.log(damping.viscosity)]
         self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
-        self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
+        self.stiffness = nn.Parameter(torch.zeros(()))
+        self.damping = nn.Parameter(torch.zeros(2), requires_grad=damping.trained)
         self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
 
