@@ -375,6 +375,23 @@ def test_every_model_of_it_can_be_made_stiffer() -> None:
     assert torch.isfinite(live.rollout(SimState(rest, 0.99 * rest), 3).positions).all()
 
 
+@pytest.mark.parametrize("given", [Damping(0.02, 1e-6), Damping(0.0, 0.02)])
+@torch.no_grad()
+def test_every_model_of_it_can_be_damped(given: Damping) -> None:
+    """By its drag; where it has none, by its viscosity."""
+    model = neural_model(template=partial(NEURAL["template"], damping=given))
+    live = scene_dynamics(model)
+
+    def damping() -> torch.Tensor:
+        return model.template.matrices(0, *_material_of(model), 1 / 24).damping.trace()
+
+    before = damping()
+    live.adjust(1.0, 4.0)
+    assert float(damping() / before) > 2
+    live.adjust(1.0, 1.0)  # over the beginning, not over the last
+    torch.testing.assert_close(damping(), before)
+
+
 def _material_of(model):
     batch = model.batch((0,))
     units = fixed_units(batch, model.masses(batch)[0], model.attributes[0])[1][-1]

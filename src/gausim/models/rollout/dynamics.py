@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -62,10 +63,16 @@ class MaterialDynamics(SceneDynamics):
         self._ceiling = energy_ceiling
 
     def adjust(self, stiffness: float, damping: float) -> None:
-        """Multiplies stiffness and damping, as they were at the beginning, by factors > 0; see :class:`Adjustable`."""
-        changed = self._given.clone()
+        """Multiplies stiffness and damping, as they were at the beginning, by factors > 0; see :class:`Adjustable`.
+
+        Where a body has no drag, viscosity is what is multiplied.
+        """
+        changed, template = self._given.clone(), cast(MaterialTemplate, self.model.template)
         changed[:, 0] += math.log(stiffness)
-        changed[:, 1] += math.log(damping)
+        if template.has_drag:
+            changed[:, 1] += math.log(damping)
+        else:
+            template.thickened[self.scene_id] = damping
         self.model.attributes[self.scene_id].data.copy_(changed)
         self.energy_ceiling = None if self._ceiling is None else stiffness * self._ceiling  # the same motion
 

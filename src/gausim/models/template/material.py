@@ -162,6 +162,7 @@ class MaterialTemplate(Template):
         self.log_k = 2 * math.log(2 * math.pi / period)
         logs = [math.log(damping.drag) if damping.drag else -math.inf, math.log(damping.viscosity)]
         self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
+        self.thickened: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.damping = nn.Parameter(torch.zeros(2), requires_grad=damping.trained)
         self.unit_decoder = mlp((attributes, hidden, 3))
@@ -216,6 +217,7 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = self._damping()
+        viscosity = viscosity * self.thickened.get(scene_id, 1.0)
         springs = self.links.springs * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         cells = units[:, :2].exp()
