@@ -1,45 +1,36 @@
-"""Decoding of image files by OpenCV, after a check of the declared size, which a damaged file may exaggerate."""
+"""Decoding of image files by OpenCV, after checks of declared sizes, which a damaged file may exaggerate."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+T = TypeVar("T")
 
 # Tag of the sub-directory of EXIF data.
 _EXIF = 0x8769
 
 
 def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded."""
-    if not _is_whole(path):
+    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded.
+
+    Checksums come first, where the format has them: OpenCV makes room for whatever length a damaged part states.
+    """
+    if not _opened(path, _is_whole):
         return None
     try:
         return cv2.imread(str(path), flags)
     except (cv2.error, MemoryError):
         return None
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether the header and, where the format has them, all checksums are right.
-
-    OpenCV makes room for whatever length a damaged part states.
-    """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path) as image:
-                image.verify()
-        return True
-    except Exception:  # Pillow's readers raise many kinds of exceptions on damaged files
-        return False
 
 
 @dataclass(frozen=True)
@@ -57,14 +48,27 @@ def read_header(path: Path) -> ImageHeader | None:
 
     None also above 178 million pixels, where Pillow considers the header damaged.
     """
+    return _opened(path, _header)
+
+
+def _opened(path: Path, read: Callable[[Image], T]) -> T | None:
+    """What is read from an image that Pillow has opened but not decoded; None where it raises anything."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                tags = image.getexif()
-                exif = {**tags, **tags.get_ifd(_EXIF)}
-                return ImageHeader(image.width, image.height, image.mode, exif)
+                return read(image)
     except Exception:  # Pillow's readers raise many kinds of exceptions on damaged files
         return None
+
+
+def _header(image: Image) -> ImageHeader:
+    tags = image.getexif()
+    return ImageHeader(image.width, image.height, image.mode, {**tags, **tags.get_ifd(_EXIF)})
+
+
+def _is_whole(image: Image) -> bool:
+    image.verify()  # raises otherwise
+    return True

@@ -160,18 +160,14 @@ class MaterialTemplate(Template):
         if damping.drag < 0 or damping.viscosity <= 0:
             raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
         self.log_k = 2 * math.log(2 * math.pi / period)
-        logs = [math.log(damping.drag) if damping.drag else -math.inf, math.log(damping.viscosity)]
+        self.initial, self.has_drag = damping, damping.drag > 0
+        logs = [self.log_drag if self.has_drag else -math.inf, math.log(damping.viscosity)]
         self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
         self.thickened: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.damping = nn.Parameter(torch.zeros(2), requires_grad=damping.trained)
         self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
-
-    @property
-    def has_drag(self) -> bool:
-        """Whether c_0 is not 0."""
-        return bool(torch.isfinite(cast(Tensor, self.log_damping)[0]))
 
     @property
     def log_drag(self) -> float:
@@ -182,7 +178,7 @@ class MaterialTemplate(Template):
         """
         if not self.has_drag:
             raise ConfigError("model.simulator.template.damping.drag is 0: no attribute can set the damping of a body.")
-        return float(cast(Tensor, self.log_damping)[0])
+        return math.log(self.initial.drag)
 
     def body(self, scene_id: int) -> BodyModes:
         """Modes of one scene."""
@@ -205,9 +201,10 @@ class MaterialTemplate(Template):
         between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
         return own + _saturated(units), between + _saturated(links)
 
-    def _damping(self) -> Float[Tensor, " 2"]:
-        """c_0 and c_1 [1 / frame, frames]."""
-        return (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+    def _damping(self, scene_id: int) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """c_0 and c_1 of a scene [1 / frame, frames]."""
+        drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+        return drag, viscosity * self.thickened.get(scene_id, 1.0)
 
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float | Tensor
@@ -216,8 +213,7 @@ class MaterialTemplate(Template):
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
         units, links = self.decode(body, attributes)
         k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
-        drag, viscosity = self._damping()
-        viscosity = viscosity * self.thickened.get(scene_id, 1.0)
+        drag, viscosity = self._damping(scene_id)
         springs = self.links.springs * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         cells = units[:, :2].exp()
@@ -227,7 +223,8 @@ class MaterialTemplate(Template):
         root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
         inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
         lost = (drag * frame * units[:, 2].exp()).div(2).tanh()
-        loss = sum(lost.index_select(0, end) for end in body.springs.ends)[:, None, None]  # twice a link's mean
+        first, second = (lost.index_select(0, end) for end in body.springs.ends)
+        loss = (first + second)[:, None, None]  # twice a link's mean
         dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
         dragged = dragged + body.between.flatten(0, 1).mT @ (loss * tied).flatten(0, 1)
         rate = _trace(dragged) / _trace(inertia)
@@ -262,7 +259,7 @@ class MaterialTemplate(Template):
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
         if self.has_drag:
-            drag = REFERENCE_FPS * self._damping()[0] * decoded[:, 2].exp()
+            drag = REFERENCE_FPS * self._damping(scene_id)[0] * decoded[:, 2].exp()
             found["damping"] = Property(drag, "drag over momentum [1/s]")
         return found
 
