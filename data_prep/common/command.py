@@ -47,9 +47,9 @@ class Options:
         for each in fields(self):
             value, (least, most) = getattr(self, each.name), each.metadata.get("range", (-math.inf, math.inf))
             choices = each.metadata.get("argument", {}).get("choices")
-            if choices and value not in choices:
-                raise ConfigError(f"{_flag(each.name)}: expected one of {', '.join(choices)}, got '{value}'.")
             for number in value if isinstance(value, tuple) else (value,):
+                if choices and number not in choices:
+                    raise ConfigError(f"{_flag(each.name)}: expected one of {', '.join(choices)}, got '{number}'.")
                 if isinstance(number, (int, float)) and not (math.isfinite(number) and least <= number <= most):
                     expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
                     raise ConfigError(f"{_flag(each.name)}: expected {expected}, got {number:g}.")

@@ -21,7 +21,8 @@ from gausim.core import DivergenceError
 from gausim.data.corpus import BodyRecord, PushRecord
 
 MODES = 32
-# Costs that are not paid: element steps per frame by finite elements, point steps by material points.
+# Costs that are not paid: element steps per frame by finite elements (of bodies of CELLS; as fast ones of more cells
+# take more), point steps by material points.
 MOST_COST, MOST_POINT_COST = 3e5, 1.2e5
 PUSH_TRIALS, WEAKER, STRONGER = 4, 0.6, 2.0
 BODY_TRIALS, KIND_TRIALS = 60, 6  # draws of a body, and those of one kind of shape and pins
@@ -54,7 +55,7 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
     Raises:
         DivergenceError: none of many draws gave motion worth keeping, which no plan within its limits brings about.
     """
-    shapes: list[str | Path] = [*SHAPES, *plan.meshes]
+    shapes: list[str | Path] = [*plan.shapes, *plan.meshes]
     # Bodies of the second simulator are spread evenly over the corpus.
     second = int((number + 1) * plan.second) > int(number * plan.second)
     redrawn = 0
@@ -77,19 +78,22 @@ def _draw(plan: Plan, kind: str | Path, pins: str, rng: Rng, *, second: bool) ->
     """A body of a kind of shape, or of a mesh, at rest."""
     field = SHAPES[kind](rng) if isinstance(kind, str) else from_mesh(kind)
     shape = kind if isinstance(kind, str) else kind.name
-    body = body_of(field, int(rng.integers(*CELLS)))
+    body = body_of(field, int(rng.integers(*plan.cells)))
     held = body and pinned(warped(body, float(np.exp(rng.uniform(*np.log(DIAGONALS)))), rng), pins, rng)
     if held is None:
         raise Rejected
     fps = float(rng.choice(RATES))
     period = float(np.exp(rng.uniform(*np.log(PERIODS))))
-    relative = random_matter(held, rng, even_drag=second)
+    relative = random_matter(held, rng, kinds=plan.materials, even_drag=second)
+    if relative.kind not in plan.materials:
+        raise Rejected
     modes = modes_of(held, relative, MODES)
     faster = 2 * np.pi * fps / period / modes.omega[0]
     drag = relative.drag * random_drag(modes.omega[0] * faster, rng)
     matter = replace(relative, young_modulus=relative.young_modulus * faster**2, drag=drag)
     modes = replace(modes, omega=modes.omega * faster, highest=modes.highest * faster)
-    if modes.highest / fps * 6 * len(held.cells) > MOST_COST:
+    finer = (plan.cells[1] / CELLS[1]) ** (4 / 3)
+    if modes.highest / fps * 6 * len(held.cells) > MOST_COST * finer:
         raise Rejected
     points = _kernels(held, int(rng.integers(plan.kernels[0], plan.kernels[1] + 1)), rng)
     simulator: Simulator

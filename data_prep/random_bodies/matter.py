@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import eigsh
 
-from data_prep.random_bodies.plan import CONTRASTS, DAMPING_RATIOS, DENSITIES, POISSON_RATIOS
+from data_prep.random_bodies.plan import CONTRASTS, DAMPING_RATIOS, DENSITIES, HALVES, POISSON_RATIOS
 from data_prep.random_bodies.shapes import Rng
 from data_prep.synthetic.bodies import Array, Body, tet_volumes
 from gausim.core import DivergenceError
@@ -18,7 +19,7 @@ from gausim.core import DivergenceError
 class Matter:
     """Elastic material, per cell."""
 
-    kind: str  # ``even``, ``split`` (two materials) or ``smooth``
+    kind: str  # ``even``, ``split`` (two materials), ``halves`` (two stiffnesses, across the body) or ``smooth``
     contrast: float  # largest stiffness over the smallest
     poisson_ratio: float
     young_modulus: Array  # (C,) [mass / (scene unit s^2)]
@@ -46,13 +47,16 @@ class Modes:
     highest: float  # angular frequency of the fastest mode of all [1/s]
 
 
-def random_matter(body: Body, rng: Rng, *, even_drag: bool) -> Matter:
-    """Material whose stiffness and drag are relative, their means 1; half of the bodies are uneven."""
-    kind = str(rng.choice(["even", "even", "split", "smooth"]))
+def random_matter(body: Body, rng: Rng, *, kinds: Sequence[str], even_drag: bool) -> Matter:
+    """Material whose stiffness and drag are relative, their means 1; even where two halves come out as one."""
+    kind = str(rng.choice(kinds))
     middle = body.nodes[body.cells].mean(1)
     direction = rng.normal(size=3)
     along = (middle - middle[rng.integers(len(middle))]) @ (direction / np.linalg.norm(direction)) / body.diagonal
-    if kind == "smooth":
+    if kind == "halves":
+        place = middle[:, np.ptp(middle, axis=0).argmax()]
+        level = (rng.choice([-1, 1]) * (place - np.quantile(place, rng.uniform(*HALVES))) > 0).astype(float)
+    elif kind == "smooth":
         wave = np.sin(rng.uniform(2, 6) * along + rng.uniform(0, 6))
         level = (wave - wave.min()) / np.ptp(wave)
     else:
@@ -61,6 +65,8 @@ def random_matter(body: Body, rng: Rng, *, even_drag: bool) -> Matter:
         kind = "even"
     contrast = float(np.exp(rng.uniform(*np.log(CONTRASTS))))
     density, drag = rng.uniform(-1, 1) * np.log(3), 0.0 if even_drag else rng.uniform(-1, 1) * np.log(4)
+    if kind == "halves":
+        density = drag = 0.0
     young = contrast**level
     return Matter(
         kind=kind,

@@ -13,8 +13,11 @@ DENSITIES = (10.0, 1000.0)  # mean of a body [mass / scene unit^3]
 DAMPING_RATIOS = (0.003, 0.3)  # of the slowest mode, relative to critical damping
 DIAGONALS = (0.5, 3.0)  # [scene units]
 POISSON_RATIOS = (0.2, 0.42)
-CELLS = (110, 260)  # hexahedral cells of a body, each of six tetrahedra
+CELLS = (110, 260)  # hexahedral cells of a body, each of six tetrahedra, unless more are asked for
+SHAPES = ("blob", "superquadric", "stem", "slab", "shell", "fork", "lattice", "ring", "figure")
+MATERIALS = ("even", "even", "split", "smooth")  # half of the bodies are even
 CONTRASTS = (2.0, 30.0)  # of stiffness within an uneven body
+HALVES = (0.35, 0.65)  # part of a body on one side of the plane between its halves
 # A sequence is kept if its largest displacement lies here [diagonals] and no volume shrinks below a fraction.
 KEPT_SWING, LEAST_VOLUME = (0.015, 0.45), 0.1
 
@@ -29,6 +32,17 @@ class Plan(Options):
     kernels: tuple[int, int] = option(
         (400, 800), "fewest and most kernels of a body (400 800)", least=50, interval=True, metavar=("FEWEST", "MOST")
     )
+    cells: tuple[int, int] = option(
+        CELLS, "fewest and most hexahedral cells of a body, each of six linear elements (110 260)", least=50,
+        interval=True, metavar=("FEWEST", "MOST"),
+    )  # fmt: skip
+    shapes: tuple[str, ...] = option(
+        SHAPES, "kinds of shape, each as likely as the others (all but the bar)", nargs="+", choices=(*SHAPES, "bar")
+    )
+    materials: tuple[str, ...] = option(
+        MATERIALS, "kinds of material: even, split at any plane, halves that differ in stiffness alone, "
+        "smooth (even even split smooth)", nargs="+", choices=("even", "split", "halves", "smooth"),
+    )  # fmt: skip
     swing: tuple[float, float] = option(
         (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal] (0.02 0.3)", least=1e-3, most=0.4,
         interval=True,

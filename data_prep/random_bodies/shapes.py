@@ -35,6 +35,12 @@ def superquadric(rng: Rng) -> Field:
     return field
 
 
+def bar(rng: Rng) -> Field:
+    """A straight bar with a rectangle across."""
+    half = np.array([*rng.uniform(0.16, 0.26, 2), 1.0])
+    return lambda p: (half - np.abs(p)).min(1)
+
+
 def stem(rng: Rng) -> Field:
     """A curved stem with a head, some with a leaf."""
     height = np.linspace(0, 1, 7)
@@ -165,7 +171,7 @@ def from_mesh(path: Path) -> Field:
 
 
 SHAPES: dict[str, Callable[[Rng], Field]] = {
-    kind.__name__: kind for kind in (blob, superquadric, stem, slab, shell, fork, lattice, ring, figure)
+    kind.__name__: kind for kind in (blob, superquadric, stem, slab, shell, fork, lattice, ring, figure, bar)
 }
 
 

@@ -18,10 +18,12 @@ from data_prep.random_bodies import maker, shapes
 from data_prep.random_bodies.lattice import PINS, body_of, pinned, warped
 from data_prep.random_bodies.matter import Matter, Modes, modes_of
 from data_prep.random_bodies.motion import FiniteElements, MaterialPoints
+from data_prep.random_bodies.plan import Plan
 from data_prep.random_bodies.shapes import SHAPES, from_mesh
 from data_prep.synthetic.bodies import Array, Body, tet_volumes
 from data_prep.synthetic.bodies import _body as lattice
 from data_prep.synthetic.embedding import Embedding
+from gausim.core import ConfigError
 from gausim.data.corpus import MANIFEST, Corpus
 
 TINY = "--sequences 1 --frames 6 --kernels 60 70 --workers".split()
@@ -134,6 +136,18 @@ def test_interrupted_corpus_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     made.append(-1)
     assert main([*command, str(out)]) == 0 and made == [0, -1, 1]
     assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_kinds_of_shape_and_material_are_those_asked_for() -> None:
+    plan = Plan(shapes=("bar",), materials=("halves",), cells=(150, 200), sequences=1, frames=4, second=0)
+    tensors, record = maker.make_body(plan, 0)
+    assert (record.shape, record.material) == ("bar", "halves") and len(np.unique(tensors["stiffness"])) == 2
+    assert np.ptp(tensors["density"]) == 0
+    stiff = tensors["stiffness"] == tensors["stiffness"].max()
+    length = tensors["rest"][:, 2]
+    assert length[stiff].max() < length[~stiff].min() + 0.1 or length[stiff].min() > length[~stiff].max() - 0.1
+    with pytest.raises(ConfigError, match="--shapes: expected one of blob, .* bar, got 'cube'"):
+        Plan(shapes=("bar", "cube"))
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from helpers.bodies import make_model, make_scene, make_state
 
 from gausim.models.step import predictor
 from gausim.models.step.features import network_inputs
-from gausim.models.template.template import PreparedTemplate, Template, TemplateState
+from gausim.models.template.template import PreparedTemplate, Template, TemplateState, local_means
 
 
 class _Fixed(PreparedTemplate):
@@ -116,3 +116,15 @@ def test_inputs_are_made_of_the_centres_of_mass_and_of_the_solved_parents(coarse
             above, coarser = after[hierarchy.levels[1].parent], unit
         else:
             torch.testing.assert_close((parents.now, parents.before), (coarser.now, coarser.before))
+
+
+def test_maps_of_material_leave_out_what_single_units_have() -> None:
+    """A step of stiffness along a rod stays, a factor on every other point goes; what is not known does not count."""
+    points = torch.zeros(3000, 3, dtype=torch.float64)
+    points[:, 0] = torch.linspace(0, 1, 3000)
+    known = points[:, 0] < 0.9
+    step, single = 4.0 ** (points[:, 0] > 0.5).double(), 3.0 ** (torch.arange(3000) % 2 - 0.5)
+    found = local_means(torch.where(known, step * single, torch.nan), points, known, 0.05)
+    torch.testing.assert_close(found, local_means(step, points, known, 0.05), rtol=1e-2, atol=0)
+    torch.testing.assert_close(found[[450, 2400, 2999]], torch.tensor([1.0, 4.0, 4.0]).double(), rtol=1e-2, atol=0)
+    assert float(found[1500]) == pytest.approx(2.0, rel=1e-2)

@@ -49,7 +49,7 @@ class BodyRecord(Struct, frozen=True, forbid_unknown_fields=True):
     shard: _Name  # file that holds it
     shape: str  # kind of its shape, such as ``fork``, or the mesh's file name
     pins: str  # kind of its pins
-    material: str  # ``even``, ``split`` (two materials) or ``smooth``
+    material: str  # ``even``, ``split`` or ``halves`` (two materials), or ``smooth``
     contrast: _Size  # largest stiffness over the smallest
     simulator: str  # that moved it
     kernels: _Count

@@ -33,7 +33,7 @@ class BodyFigures(msgspec.Struct, frozen=True):
     """Figures of one body; sums over its sequences and the frames of each range, in diagonals."""
 
     name: str  # of the body
-    material: str  # kind of its material: even, split or smooth
+    material: str  # kind of its material: even, split, halves or smooth
     # distance of the predicted kernels from the true ones: seen frames, the ten after, all unseen ones
     error: tuple[float, float, float]
     static: tuple[float, float, float]  # the same of the rest state
@@ -105,8 +105,8 @@ def _fitted(model: GausSim, scene_id: int, item: BodyData) -> tuple[float, float
     true = body.stiffness.index_select(0, model.hierarchies[scene_id].kernels).log()[:, None].to(attributes)
     level = fixed_units(batch, mass, true)[1][-1].attributes[:, 0]
     free = ~batch.levels[-1].pinned
-    decoded = template.decode(template.body(scene_id), unit.attributes)[0][:, 0]
-    return period, _ranks(decoded[free], level[free])
+    fitted = model.material_of_units(scene_id)["stiffness"].values
+    return period, _ranks(fitted[free], level[free])
 
 
 def summary(found: Sequence[BodyFigures]) -> CorpusFigures:
@@ -114,13 +114,14 @@ def summary(found: Sequence[BodyFigures]) -> CorpusFigures:
     error, static, energy = (torch.tensor([getattr(x, name) for x in found]) for name in ("error", "static", "energy"))
     fitted = [x for x in found if x.fitted_period is not None]
     stiffness = _ranks(*(torch.tensor([-getattr(x, n) for x in fitted]) for n in ("fitted_period", "period")))
-    within = {
-        kind: [x.within for x in found if x.within is not None and x.material == kind] for kind in ("split", "smooth")
-    }
+    within = [
+        [x.within for x in found if x.within is not None and (x.material == "smooth") == smooth]
+        for smooth in (False, True)
+    ]
     return CorpusFigures(
         len(found), tuple((error.sum(0) / static.sum(0)).tolist()), float((error / static)[:, 2].median()),
         float(energy[:, 0].sum() / energy[:, 1].sum()), stiffness,
-        *(sum(values) / len(values) if values else None for values in within.values()),
+        *(sum(values) / len(values) if values else None for values in within),
     )  # fmt: skip
 
 

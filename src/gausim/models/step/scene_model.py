@@ -22,11 +22,13 @@ from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.modal import ModalScene
 from gausim.models.template.solid import SolidSettings
-from gausim.models.template.template import Motion, PreparedScenes, Property, Template
+from gausim.models.template.template import Motion, PreparedScenes, Property, Template, local_means
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
 MOST_BATCHES = 256
+# Deviation of the Gaussian that maps of learned material are averaged with [diagonals].
+MAP_WIDTH = 0.15
 
 
 class SceneModel(nn.Module, ABC):
@@ -198,14 +200,29 @@ class SceneModel(nn.Module, ABC):
         return SmoothMotions(kernels, rows, still.index_copy(0, hierarchy.kernels, unit), sizes)
 
     @torch.no_grad()
+    def material_of_units(self, scene_id: int) -> dict[str, Property]:
+        """The same of the finest predicted units: what the template has learned, averaged over their surroundings.
+
+        The values of single units also make up for what the template does not know of a body. What varies over
+        :data:`MAP_WIDTH` is what motion tells of its material.
+        """
+        batch = self.batch((scene_id,))
+        finest = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])[1][-1]
+        known, free = self.template.material(scene_id, finest, self.fps[scene_id]), ~batch.levels[-1].pinned
+        width = MAP_WIDTH * self.scenes[scene_id].diagonal
+        return {
+            name: Property(local_means(found.values, finest.rest.to(found.values), free, width), found.text)
+            for name, found in known.items()
+        }
+
+    @torch.no_grad()
     def material(self, scene_id: int) -> dict[str, Property]:
         """Learned properties of the scene's kernels: ``density``, and ``stiffness`` and ``damping`` if it knows them.
 
-        Each kernel has the value of its finest predicted unit; NaN for kernels that never move.
+        Each kernel has the value of its finest predicted unit (:meth:`material_of_units`); NaN for kernels that never
+        move.
         """
-        batch, scene = self.batch((scene_id,)), self.scenes[scene_id]
-        _, units = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
-        known = self.template.material(scene_id, units[-1], self.fps[scene_id])
+        batch, scene, known = self.batch((scene_id,)), self.scenes[scene_id], self.material_of_units(scene_id)
 
         def of_kernels(values: Tensor) -> Tensor:
             every = torch.full((scene.count,), torch.nan)

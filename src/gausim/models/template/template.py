@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from gausim.models.hierarchy.batch import SceneBatch
@@ -26,6 +26,7 @@ from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
+ROWS = 1024  # of a matrix of distances that are in memory at once
 DENSITY = "density over that at the beginning of training"
 
 
@@ -52,6 +53,15 @@ class Property:
 
     values: Float[Tensor, " N"]  # positive; of units, or of kernels, NaN where it is not known
     text: str  # what it is, with its unit
+
+
+def local_means(
+    values: Float[Tensor, " N"], points: Float[Tensor, "N 3"], known: Bool[Tensor, " N"], width: float
+) -> Float[Tensor, " N"]:
+    """Geometric means of known positive values around every point, weighted by a Gaussian of this deviation."""
+    logs, among = values[known].log(), points[known]
+    parts = [torch.cdist(rows, among).div(width).square().div(-2).softmax(-1) @ logs for rows in points.split(ROWS)]
+    return torch.cat(parts).exp()
 
 
 class PreparedTemplate:
