@@ -68,6 +68,7 @@ def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None]
         ("schema", "gausim.corpus/9", "field 'schema' is 'gausim.corpus/9', expected"),
         ("seed", "none", "field 'seed': expected"),
         ("bodies", [{"name": "a"}], "bodies"),
+        ("bodies", [], "bodies"),
     ],
 )
 def test_a_damaged_manifest_is_named(tmp_path: Path, key: str, value: object, message: str) -> None:

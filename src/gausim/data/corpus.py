@@ -71,7 +71,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True):
     seed: int
     settings: dict[str, object]
     redrawn: int  # bodies and pushes that exploded or hardly moved
-    bodies: tuple[BodyRecord, ...]
+    bodies: Annotated[tuple[BodyRecord, ...], Meta(min_length=1)]
 
 
 @dataclass(frozen=True, eq=False)
