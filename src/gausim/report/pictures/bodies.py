@@ -49,7 +49,10 @@ def bodies_figure(errors: Mapping[int, Mapping[int, float]], path: Path) -> None
         axes.plot(list(line), list(line.values()), "o-", color=color, label=f"{frames} frames seen")
     axes.axhline(1.0, linestyle="--", color="#555555", linewidth=1.0, label="static")
     counts = sorted({count for line in errors.values() for count in line})
-    axes.set_xscale("symlog", linthresh=10)
+    if counts[0] > 0:
+        axes.set_xscale("log")
+    else:  # a network that has seen no body
+        axes.set_xscale("symlog", linthresh=10)
     axes.set_xticks(counts, [str(count) for count in counts])
     axes.minorticks_off()
     axes.set(xlabel="bodies pretrained on", ylabel="3D error of unseen frames ÷ static", ylim=(0, None))
