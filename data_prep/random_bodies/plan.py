@@ -37,11 +37,12 @@ class Plan(Options):
         interval=True, metavar=("FEWEST", "MOST"),
     )  # fmt: skip
     shapes: tuple[str, ...] = option(
-        SHAPES, "kinds of shape, each as likely as the others (all but the bar)", nargs="+", choices=(*SHAPES, "bar")
-    )
+        SHAPES, f"kinds of shape, each as likely as the others ({' '.join(SHAPES)}); besides these there is: bar",
+        nargs="+", choices=(*SHAPES, "bar"), metavar="KIND",
+    )  # fmt: skip
     materials: tuple[str, ...] = option(
-        MATERIALS, "kinds of material: even, split at any plane, halves that differ in stiffness alone, "
-        "smooth (even even split smooth)", nargs="+", choices=("even", "split", "halves", "smooth"),
+        MATERIALS, "kinds of material (even even split smooth): even, split at any plane, smooth, or halves differing "
+        "in stiffness alone", nargs="+", choices=("even", "split", "halves", "smooth"), metavar="KIND",
     )  # fmt: skip
     swing: tuple[float, float] = option(
         (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal] (0.02 0.3)", least=1e-3, most=0.4,
