@@ -47,12 +47,12 @@ class Options:
         for each in fields(self):
             value, (least, most) = getattr(self, each.name), each.metadata.get("range", (-math.inf, math.inf))
             choices = each.metadata.get("argument", {}).get("choices")
-            for number in value if isinstance(value, tuple) else (value,):
-                if choices and number not in choices:
-                    raise ConfigError(f"{_flag(each.name)}: expected one of {', '.join(choices)}, got '{number}'.")
-                if isinstance(number, (int, float)) and not (math.isfinite(number) and least <= number <= most):
+            for one in value if isinstance(value, tuple) else (value,):
+                if choices and one not in choices:
+                    raise ConfigError(f"{_flag(each.name)}: expected one of {', '.join(choices)}, got '{one}'.")
+                if isinstance(one, (int, float)) and not (math.isfinite(one) and least <= one <= most):
                     expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
-                    raise ConfigError(f"{_flag(each.name)}: expected {expected}, got {number:g}.")
+                    raise ConfigError(f"{_flag(each.name)}: expected {expected}, got {one:g}.")
             if each.metadata.get("interval") and value is not None and value[0] > value[1]:
                 raise ConfigError(f"{_flag(each.name)}: expected LOW <= HIGH, got {value[0]:g} {value[1]:g}.")
 

@@ -201,10 +201,10 @@ class SceneModel(nn.Module, ABC):
 
     @torch.no_grad()
     def material_of_units(self, scene_id: int) -> dict[str, Property]:
-        """The same of the finest predicted units: what the template has learned, averaged over their surroundings.
+        """Learned properties of the finest predicted units by name, averaged over their surroundings.
 
-        The values of single units also make up for what the template does not know of a body. What varies over
-        :data:`MAP_WIDTH` is what motion tells of its material.
+        The values of single units also make up for what the template does not know of a body: only what is left at
+        :data:`MAP_WIDTH` is read as its material.
         """
         batch = self.batch((scene_id,))
         finest = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])[1][-1]
