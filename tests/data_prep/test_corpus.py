@@ -139,6 +139,7 @@ def test_interrupted_corpus_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_kinds_of_shape_and_material_are_those_asked_for() -> None:
+    assert set(SHAPES) == {*Plan().shapes, "bar"}
     plan = Plan(shapes=("bar",), materials=("halves",), cells=(150, 200), sequences=1, frames=4, second=0)
     tensors, record = maker.make_body(plan, 0)
     assert (record.shape, record.material) == ("bar", "halves") and len(np.unique(tensors["stiffness"])) == 2

@@ -15,7 +15,7 @@ from helpers.simulators import silence
 from gausim.core import Adjustable, ConfigError, SimState
 from gausim.evaluation.stability import _LinearStep, largest_eigenvalue
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import FixedUnits, fixed_units
+from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.template.body_modes import CURVED
 from gausim.models.template.material import Damping, Links, MaterialTemplate, PreparedMaterial
@@ -393,6 +393,5 @@ def test_every_model_of_it_can_be_damped(given: Damping) -> None:
 
 
 def _material_of(model):
-    batch = model.batch((0,))
-    units = fixed_units(batch, model.masses(batch)[0], model.attributes[0])[1][-1]
+    units = model.units(model.batch((0,)))[-1][-1]
     return units.log_density, units.attributes

@@ -96,13 +96,12 @@ def _figures(
 def _fitted(model: GausSim, scene_id: int, item: BodyData) -> tuple[float, float | None]:
     """Period of the slowest mode of the fitted material [s], and the rank correlation of stiffness over units."""
     template, body = cast(MaterialTemplate, model.template), item.body
-    batch, attributes = model.batch((scene_id,)), model.attributes[scene_id]
-    mass = model.masses(batch)[0]
-    unit = fixed_units(batch, mass, attributes)[1][-1]
+    batch = model.batch((scene_id,))
+    mass, _, (*_, unit) = model.units(batch)
     period = template.slowest_period(scene_id, unit.log_density, unit.attributes)
     if body.record.material == "even":
         return period, None
-    true = body.stiffness.index_select(0, model.hierarchies[scene_id].kernels).log()[:, None].to(attributes)
+    true = body.stiffness.index_select(0, model.hierarchies[scene_id].kernels).log()[:, None].to(unit.attributes)
     level = fixed_units(batch, mass, true)[1][-1].attributes[:, 0]
     free = ~batch.levels[-1].pinned
     fitted = model.material_of_units(scene_id)["stiffness"].values

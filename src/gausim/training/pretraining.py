@@ -13,7 +13,6 @@ from torch import Tensor
 from gausim.core import ConfigError, SimState
 from gausim.data.corpus import CorpusBody
 from gausim.data.pretraining import CorpusDataModule
-from gausim.models.hierarchy.units import fixed_units
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import REFERENCE_FPS, MaterialTemplate
 from gausim.training.contracts import Simulator
@@ -105,6 +104,6 @@ def _give(
     attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.log_drag))).clamp_min(LEAST_DAMPING).log()
     batch = model.batch((scene_id,))
     for _ in range(ROUNDS):
-        unit = fixed_units(batch, model.masses(batch)[0], attributes)[1][-1]
+        unit = model.units(batch)[-1][-1]
         made = template.slowest_period(scene_id, unit.log_density, unit.attributes)
         attributes[:, 0] += 2 * math.log(made / period)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import fixed_units
+from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.reference.surroundings import SceneSurroundings
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
@@ -118,6 +118,12 @@ class SceneModel(nn.Module, ABC):
         log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
         return log_density.exp() * batch.volume, log_density
 
+    def units(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " K"], tuple[FixedUnits, ...]]:
+        """Masses of the simulated kernels, and what :func:`gausim.models.hierarchy.units.fixed_units` makes of them."""
+        mass, _ = self.masses(batch)
+        attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
+        return mass, *fixed_units(batch, mass, attributes)
+
     def modal_scene(self, scene_id: int) -> ModalScene:
         """The template of one scene in modal coordinates, between two updates of the parameters.
 
@@ -125,8 +131,7 @@ class SceneModel(nn.Module, ABC):
             ConfigError: the template has no modes.
         """
         batch = self.batch((scene_id,))
-        _, units = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
-        template = self.template.prepare(batch, units[-1])
+        template = self.template.prepare(batch, self.units(batch)[-1][-1])
         if not isinstance(template, PreparedScenes):
             raise ConfigError(f"model.simulator.template: {type(self.template).__name__} has no modes.")
         return template.parts[0][0]
@@ -135,7 +140,7 @@ class SceneModel(nn.Module, ABC):
     def modal_projection(self, scene_id: int) -> Float[Tensor, "K 3 M"]:
         """P with z = sum_k u_k P_k, the modal coordinates of displacements u of the kernels of a scene."""
         batch = self.batch((scene_id,))
-        fraction, _ = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
+        _, fraction, _ = self.units(batch)
         projection = self.modal_scene(scene_id).projection.unflatten(0, (-1, 3))
         frames = self.frames(batch)
         if frames is not None:
@@ -207,7 +212,7 @@ class SceneModel(nn.Module, ABC):
         :data:`MAP_WIDTH` is read as its material.
         """
         batch = self.batch((scene_id,))
-        finest = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])[1][-1]
+        finest = self.units(batch)[-1][-1]
         known, free = self.template.material(scene_id, finest, self.fps[scene_id]), ~batch.levels[-1].pinned
         width = MAP_WIDTH * self.scenes[scene_id].diagonal
         return {

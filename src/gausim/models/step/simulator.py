@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
-from gausim.models.hierarchy.units import FixedUnits, fixed_units, weighted_sum
+from gausim.models.hierarchy.units import FixedUnits, weighted_sum
 from gausim.models.reference.reference import HandMotion, Placed, Reference, UnitMotion
 from gausim.models.reference.surroundings import reference_of
 from gausim.models.settings import HierarchySettings, RolloutSettings
@@ -100,9 +99,7 @@ class GausSim(SceneModel):
         ``isolated`` leaves out the surroundings: the body deforms about its rest state, which nothing moves. ``driven``
         lets the pins of scenes without recorded hands move, as one hand.
         """
-        mass, _ = self.masses(batch)
-        attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
-        fraction, levels = fixed_units(batch, mass, attributes)
+        mass, fraction, levels = self.units(batch)
         top, rest = batch.levels[0], levels[-1].rest
         roots = batch.rest.index_select(0, batch.simulated.index_select(0, top.parent))
         frames = self.frames(batch)

@@ -59,9 +59,9 @@ def local_means(
     values: Float[Tensor, " N"], points: Float[Tensor, "N 3"], known: Bool[Tensor, " N"], width: float
 ) -> Float[Tensor, " N"]:
     """Geometric means of known positive values around every point, weighted by a Gaussian of this deviation."""
-    logs, among = values[known].log(), points[known]
-    parts = [torch.cdist(rows, among).div(width).square().div(-2).softmax(-1) @ logs for rows in points.split(ROWS)]
-    return torch.cat(parts).exp()
+    logs, among, exact = values[known].log(), points[known], "donot_use_mm_for_euclid_dist"  # far from the origin, too
+    chunks = (torch.cdist(rows, among, compute_mode=exact) / width for rows in points.split(ROWS))
+    return torch.cat([(-distance.square() / 2).softmax(-1) @ logs for distance in chunks]).exp()
 
 
 class PreparedTemplate:
