@@ -140,6 +140,31 @@ def test_networks_of_one_object_each_are_one_row_beside_the_joint_one(tmp_path):
     assert tables["ablation_three_gausim"].columns == (("gausim", ("full", "jointly")),)
 
 
+def on_object(name, rate, **data):
+    settings = config()
+    settings["optimizer"]["network_lr"] = rate
+    settings["data"].update(root=f"/data/{name}", **data)
+    return settings
+
+
+def test_one_sweep_over_several_objects_has_one_row_for_each_setting(tmp_path):
+    for rate in (0.001, 0.01):
+        for name in ("one", "two"):  # the keys by which only objects differ name no row
+            settings = on_object(name, rate, selections={"pinned": name}, views=f"[{name}]")
+            evaluate(write_run(tmp_path / f"{name}_{rate}", settings), make_curves(rate, name=name))
+    assert [(g.label, sorted(g.objects)) for g in study_of(tmp_path).groups] == [
+        ("gausim (network_lr=0.001)", ["one", "two"]), ("gausim (network_lr=0.01)", ["one", "two"]),
+    ]  # fmt: skip
+
+
+def test_a_method_whose_settings_were_chosen_for_each_object_is_one_row_and_told(tmp_path):
+    for name, rate in (("one", 0.001), ("two", 0.01)):
+        evaluate(write_run(tmp_path / name, on_object(name, rate)), make_curves(rate, name=name))
+    study = study_of(tmp_path)
+    assert [(g.label, sorted(g.objects)) for g in study.groups] == [("gausim", ["one", "two"])]
+    assert "gausim: its settings are not the same on all objects (optimizer.network_lr)." in study.notes
+
+
 def test_seeds_are_pooled_by_hand(sweep):
     full = study_of(sweep).groups[0]
     value = cell(full, "toy_bunny", "unseen", "train", "l2").value

@@ -20,7 +20,7 @@ NOT_MEASURED = "not measured"
 _WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections", "data.test")
 # The paper's order of rows and columns; others follow.
 _ORDER = ("jointly", "w/o network", "w/o mass", "w/o momentum", "w/o hierarchy")
-# Largest number of differing settings in a row's name.
+# Largest number of differing settings in a row's name or a note.
 _KEYS_IN_NAMES = 3
 # States of runs without a number, in the order of precedence.
 _WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
@@ -117,7 +117,7 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     members = _rows([tuple(same) for same in by_config.values()], runs)
     named = [_names(_first(about), max(map(len, about))) for about in members]
     groups = []
-    for (label, family, variation), about in zip(_distinct(named, members), members, strict=True):
+    for (label, family, variation), about in _joined(_distinct(named, members), members):
         evaluated = [entry for same in about.values() for run in same for entry in run.objects.values()]
         methods = list(dict.fromkeys(method for entry in evaluated for method in entry["methods"])) or [""]
         for method in methods:
@@ -144,6 +144,22 @@ def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -
         if row is None:
             rows.append(row := {})
         row[names] = same
+    return rows
+
+
+def _joined(
+    names: Sequence[tuple[str, str, str]], members: Sequence[About]
+) -> list[tuple[tuple[str, str, str], About]]:
+    """Joins equally named rows of different objects, as of a method whose settings were chosen for each object."""
+    rows: list[tuple[tuple[str, str, str], About]] = []
+    for name, about in zip(names, members, strict=True):
+        own = {o for same in about for o in same}
+        free = (row for known, row in rows if known == name and not any(own.intersection(same) for same in row))
+        row = next(free, None)
+        if row is None:
+            rows.append((name, dict(about)))
+        else:
+            row.update(about)
     return rows
 
 
@@ -210,17 +226,16 @@ def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> l
 
     Of several full configurations, the reference of the ablations keeps the plain label.
     """
-    objects = [[name for names in about for name in names] for about in members]
-    firsts = [_first(about) for about in members]
-    taken = Counter((label, o) for (label, _, _), names in zip(labels, objects, strict=True) for o in names)
-    plain = {_reference(family, labels, firsts) for _, family, _ in labels}
+    objects = [{name: same[0] for names, same in about.items() for name in names} for about in members]
+    taken = Counter((label, o) for (label, _, _), own in zip(labels, objects, strict=True) for o in own)
+    plain = {_reference(family, labels, [_first(about) for about in members]) for _, family, _ in labels}
     result = []
     for i, (label, family, variation) in enumerate(labels):
         if i in plain or all(taken[label, o] < 2 for o in objects[i]):
             result.append((label, family, variation))
             continue
-        rivals = [run for j, run in enumerate(firsts) if labels[j][0] == label and j != i]
-        tag = _difference(firsts[i], rivals)
+        rivals = [other for j, other in enumerate(objects) if labels[j][0] == label and j != i]
+        tag = _difference([(run, other[o]) for o, run in objects[i].items() for other in rivals if o in other])
         result.append((f"{label} ({tag})", family, tag if variation == FULL else f"{variation} ({tag})"))
     return result
 
@@ -239,15 +254,22 @@ def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequ
     return nearest[0] if len(nearest) == 1 else None
 
 
-def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:
-    if all(rival.given_name != run.given_name for rival in rivals):
-        return run.given_name
-    own = run.settings
-    differing = {key for key in own if any(rival.settings.get(key) != own[key] for rival in rivals)}
-    keys = sorted(key for key in differing if not key.endswith(("name", "root")))
-    shown = [f"{key.rsplit('.', 1)[-1]}={own[key]}" for key in keys[:_KEYS_IN_NAMES]]
-    more = f", {len(keys) - _KEYS_IN_NAMES} more" if len(keys) > _KEYS_IN_NAMES else ""
-    return ", ".join(shown) + more if shown else run.name
+def _difference(pairs: Sequence[tuple[RunRecord, RunRecord]]) -> str:
+    """What distinguishes the first of two runs on one object, in all pairs: its name, or its own settings."""
+    first = pairs[0][0]
+    if all(rival.given_name != run.given_name for run, rival in pairs):
+        return first.given_name
+    own = {key: run.settings[key] for run, rival in pairs for key in _differing(run.settings, rival.settings)}
+    return _first_few([f"{key.rsplit('.', 1)[-1]}={own[key]}" for key in sorted(own)]) or first.name
+
+
+def _differing(own: dict[str, str], other: dict[str, str]) -> list[str]:
+    return [key for key in own if other.get(key) != own[key] and not key.endswith(("name", "root"))]
+
+
+def _first_few(items: Sequence[str]) -> str:
+    more = [f"{len(items) - _KEYS_IN_NAMES} more"] if len(items) > _KEYS_IN_NAMES else []
+    return ", ".join([*items[:_KEYS_IN_NAMES], *more])
 
 
 def says(group: Group) -> list[str]:
@@ -274,6 +296,9 @@ def _notes(groups: Sequence[Group]) -> list[str]:
                 runs = ", ".join(kinds.values())
                 notes.append(f"{name}: runs were evaluated on different {what} and cannot be compared, as {runs}.")
     for group in groups:
+        own, *others = (_besides_object(same[0]) for same in group.about.values())
+        if differing := sorted({key for other in others for key in _differing(own, other)}):
+            notes.append(f"{group.label}: its settings are not the same on all objects ({_first_few(differing)}).")
         notes += [f"{group.label}: {note}" for note in says(group)]
         for same in group.about.values():
             seeds = Counter(str(r.seed) for r in same if r.summary is not None)
