@@ -19,12 +19,12 @@ import numpy as np
 from msgspec import Meta
 
 from data_prep.common.command import option
-from data_prep.common.photos import natural
 from data_prep.public.fields import check_name, field, inside, lens, viewmat
 from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import read_sized, straight
 from data_prep.public.scene import Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
+from gausim.io.files import natural
 from gausim.io.pixels import decode
 from gausim.io.plain_json import read_any_json
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 
 from gausim.core.errors import DataError
-from gausim.io.files import write_durably
+from gausim.io.files import natural, write_durably
 from gausim.io.pixels import decode, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
@@ -45,12 +44,6 @@ def list_images(folder: Path) -> list[Path]:
     if not found:
         raise DataError(f"{folder}: no images here (looked for {', '.join(SUFFIXES)}).")
     return sorted(found, key=lambda p: natural(p.name))
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorting key by which frame_2 comes before frame_10."""
-    parts = re.findall(r"[0-9]+|[^0-9]+", name)
-    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part) for part in parts]
 
 
 def open_photo(path: Path, name: str) -> Photo:

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from data_prep.capture.cameras.sources import Posed, fitted
-from data_prep.common.photos import list_images, natural, open_photo
+from data_prep.common.photos import list_images, open_photo
 from gausim.core.errors import DataError, SceneError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
+from gausim.io.files import natural
 from gausim.io.plain_json import checked, read_any_json, read_json
 
 _VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")

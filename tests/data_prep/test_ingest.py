@@ -19,9 +19,9 @@ from helpers.timecodes import label_of_frame
 from data_prep.capture.films.film import probe
 from data_prep.capture.films.sync import measure
 from data_prep.capture.films.takes import find_takes, offset_seconds
-from data_prep.common.photos import natural
 from data_prep.ingest import IngestOptions, ingest, main
 from gausim.core import DataError
+from gausim.io.files import natural
 
 Refused = Callable[..., str]
 NTSC = Fraction(30000, 1001)

@@ -115,3 +115,9 @@ def _sync_directory(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorting key by which frame_2 comes before frame_10."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part) for part in parts]

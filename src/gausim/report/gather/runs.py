@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from gausim.core import RunError
-from gausim.io.files import read_yaml
+from gausim.io.files import natural, read_yaml
 from gausim.results.summary import dig, load_summary
 from gausim.runs.defaults import flatten
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
@@ -128,7 +128,7 @@ class RunRecord:
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
-    """All runs at or below the directories ``roots``, but not in ``skip``, in the order of their paths, each once.
+    """Runs at or below ``roots``, but not in ``skip``, each once, in the natural order of their paths (2 before 10).
 
     Raises:
         RunError: a root is no directory, or there is no run at all.
@@ -158,7 +158,7 @@ def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
         elif (folder / _HYDRA / CONFIG).is_file():
             dead.append(folder)
     dead = [d for d in dead if not any(a.is_relative_to(d) for a in alive)]
-    yield from sorted(alive + dead)
+    yield from sorted(alive + dead, key=lambda folder: [natural(part) for part in folder.parts])
 
 
 def _is_run(folder: Path) -> bool:
