@@ -114,7 +114,7 @@ class SpringMass(AnchoredMotion):
         substeps: int = SUBSTEPS,
         damping: float = DAMPING,
         stiffness: float | None = None,
-        period: float = 8.0,
+        period: float = 12.0,
         **recorded: Unpack[Recorded],
     ) -> None:
         """Places anchors and springs.
