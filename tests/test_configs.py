@@ -172,8 +172,8 @@ def test_every_method_of_the_comparison_gets_the_same_number_of_trials() -> None
         assert params.pop("protocol") == objects
         assert math.prod(map(len, params.values())) == declared == 4, path
         picked = [f"{key}={v[-1]}" for key, v in params.items()]
-        config = compose("train", [f"sweep=trials/{path.name}", f"protocol={objects[-1]}", *picked])
-        assert config.protocol.part == "development"
+        config = compose("train", [f"sweep=trials/{path.name}", f"protocol={objects[0]}", *picked])
+        assert config.protocol.part == "development" and config.data.sequences[-1] == "seq_007"
         for key, values in params.items():
             assert str(OmegaConf.select(config, key)) == str(yaml.safe_load(values[-1])), (path, key)
 
