@@ -1,4 +1,4 @@
-"""Groups runs into rows: runs that differ by their seed are one row, named after their configuration."""
+"""Data of a report: groups of runs as rows of its tables, and figures pooled over their seeds."""
 
 from __future__ import annotations
 
@@ -10,24 +10,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, INIT_FROM, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.gather.rows import FULL, About, besides_object, differing, first_few, make_rows
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
 from gausim.results.summary import MOTION_ENERGY, dig
 from gausim.results.table import footnotes
 
-FULL = "full"
 NOT_MEASURED = "not measured"
-# Settings that select the object of a run.
-_WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections", "data.test")
 # The paper's order of rows and columns; others follow.
 _ORDER = ("jointly", "w/o network", "w/o mass", "w/o momentum", "w/o hierarchy")
-# Largest number of differing settings in a row's name or a note.
-_KEYS_IN_NAMES = 3
 # States of runs without a number, in the order of precedence.
 _WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
-
-
-# The runs of a row, by their objects.
-About = dict[tuple[str, ...], tuple[RunRecord, ...]]
 
 
 @dataclass(frozen=True)
@@ -108,21 +100,14 @@ class Study:
 
 
 def make_study(runs: Sequence[RunRecord]) -> Study:
-    """Groups runs and names the rows."""
-    by_config: dict[str, list[RunRecord]] = {}
-    for run in runs:
-        # A run without a configuration is a separate row.
-        key = json.dumps(run.settings, sort_keys=True) if run.config else str(run.path)
-        by_config.setdefault(key, []).append(run)
-    members = _rows([tuple(same) for same in by_config.values()], runs)
-    named = [_names(_first(about), max(map(len, about))) for about in members]
+    """Groups runs by the rows of the tables."""
     groups = []
-    for (label, family, variation), about in _joined(_distinct(named, members), members):
+    for name, about in make_rows(runs):
         evaluated = [entry for same in about.values() for run in same for entry in run.objects.values()]
         methods = list(dict.fromkeys(method for entry in evaluated for method in entry["methods"])) or [""]
         for method in methods:
-            shown = f"{label}: {method}" if len(methods) > 1 else label
-            groups.append(Group(shown, family, variation, method, about))
+            shown = f"{name.label}: {method}" if len(methods) > 1 else name.label
+            groups.append(Group(shown, name.family, name.variation, method, about))
     families = list(dict.fromkeys(g.family for g in groups))
     groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
     objects = [o for g in groups for run in g.evaluated for o in run.objects] + [o for g in groups for o in g.objects]
@@ -130,146 +115,10 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     return Study(tuple(runs), tuple(groups), names, tuple(_notes(groups)), _test_part(groups))
 
 
-def _first(about: About) -> RunRecord:
-    return next(iter(about.values()))[0]
-
-
-def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
-    """Joins runs that differ by their single object into one row; joint runs are separate rows."""
-    rows: list[About] = []
-    for same in members:
-        names, own = _objects(same, runs), _besides_object(same[0])
-        single = [row for row in rows if all(len(other) == 1 for other in (names, *row)) and same[0].config]
-        row = next((row for row in single if names not in row and _besides_object(_first(row)) == own), None)
-        if row is None:
-            rows.append(row := {})
-        row[names] = same
-    return rows
-
-
-def _joined(
-    names: Sequence[tuple[str, str, str]], members: Sequence[About]
-) -> list[tuple[tuple[str, str, str], About]]:
-    """Joins equally named rows of different objects, as of a method whose settings were chosen for each object."""
-    rows: list[tuple[tuple[str, str, str], About]] = []
-    for name, about in zip(names, members, strict=True):
-        own = {o for same in about for o in same}
-        free = (row for known, row in rows if known == name and not any(own.intersection(same) for same in row))
-        row = next(free, None)
-        if row is None:
-            rows.append((name, dict(about)))
-        else:
-            row.update(about)
-    return rows
-
-
-def _besides_object(run: RunRecord) -> dict[str, str]:
-    """The settings that do not select the object: names of sequences do, their number does not.
-
-    What a fitted method takes over was found on its object.
-    """
-    taken = (INIT_FROM,) if dig(run.config, "model", "method") else ()
-    found = run.settings_besides((*_WHICH_OBJECT, *taken))
-    return {k: v for k, v in found.items() if k != "data.sequences" or not v.startswith("[")}
-
-
 def _place(variation: str) -> list[int]:
     """Sort key of a variation: none first, then the paper's order, then the order of the runs."""
     parts = variation.split(" (")[0].split(", ") if variation != FULL else []
     return [_ORDER.index(part) if part in _ORDER else len(_ORDER) for part in parts]
-
-
-def _objects(same: Sequence[RunRecord], runs: Sequence[RunRecord]) -> tuple[str, ...]:
-    """Objects of the runs: from their summaries, else from a run on the same data, else the data's directory."""
-    names, root = _data(same[0])
-    for run in (*same, *(r for r in runs if _data(r) == (names, root))):
-        if run.objects:
-            return tuple(run.objects)
-    if isinstance(names, list) and names:
-        return tuple(str(n) for n in names)
-    roots = root if isinstance(root, list) else [root]
-    return tuple(str(r.get("root", "?") if isinstance(r, dict) else r).rstrip("/").rsplit("/", 1)[-1] for r in roots)
-
-
-def _data(run: RunRecord) -> tuple[Any, Any]:
-    data = run.config.get("data")
-    return (data.get("names"), data.get("root", "?")) if isinstance(data, dict) else (None, "?")
-
-
-_SWITCHES = ("no_network", "no_mass", "no_momentum", "no_hierarchy")  # ablations that are identified by the settings
-
-
-def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
-    """(label, family, variation) from the settings of the configuration, not from its name."""
-    simulator = dig(run.config, "model", "simulator")
-    family = run.choices.get("model") or run.given_name
-    levels = dig(simulator, "hierarchy", "levels")
-    is_flat = isinstance(levels, list) and len(levels) == 1 and dig(levels[0], "diameter") == 0
-    head = dig(simulator, "head")
-    off = [word for word, is_off in (
-        ("w/o network", dig(head, "output_scale") == 0 and dig(head, "lever") == 0),
-        ("w/o mass", dig(simulator, "conserve_mass") is False),
-        ("w/o momentum", dig(simulator, "conserve_momentum") is False),
-        ("w/o hierarchy", is_flat),
-    ) if is_off]  # fmt: skip
-    name = str(dig(run.config, "ablation", "name") or "none")
-    parts = [part for part in name.split("+") if part not in ("none", "full", "joint")]
-    if off:  # ablations by settings are named already, others of a list are not
-        parts = [part for part in parts if part not in _SWITCHES] if "+" in name else []
-    varied = [*(["jointly"] if objects > 1 else []), *off, *parts]
-    variation = ", ".join(varied) or FULL
-    return (f"{family} {variation}" if varied else family), family, variation
-
-
-def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> list[tuple[str, str, str]]:
-    """Distinguishes equal labels of two configurations on one object by the run's name or by settings.
-
-    Of several full configurations, the reference of the ablations keeps the plain label.
-    """
-    objects = [{name: same[0] for names, same in about.items() for name in names} for about in members]
-    taken = Counter((label, o) for (label, _, _), own in zip(labels, objects, strict=True) for o in own)
-    plain = {_reference(family, labels, [_first(about) for about in members]) for _, family, _ in labels}
-    result = []
-    for i, (label, family, variation) in enumerate(labels):
-        if i in plain or all(taken[label, o] < 2 for o in objects[i]):
-            result.append((label, family, variation))
-            continue
-        rivals = [other for j, other in enumerate(objects) if labels[j][0] == label and j != i]
-        tag = _difference([(run, other[o]) for o, run in objects[i].items() for other in rivals if o in other])
-        result.append((f"{label} ({tag})", family, tag if variation == FULL else f"{variation} ({tag})"))
-    return result
-
-
-def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequence[RunRecord]) -> int | None:
-    """The full configuration that differs least from the family's ablations; None without one, or in a tie."""
-    full = [i for i, label in enumerate(labels) if label[1:] == (family, FULL)]
-    ablated = [firsts[i].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
-    if not ablated:
-        return None
-    distances = []
-    for i in full:
-        own = firsts[i].settings
-        distances.append(sum(own.get(k) != other.get(k) for other in ablated for k in {*own, *other}))
-    nearest = [i for i, d in zip(full, distances, strict=True) if d == min(distances)]
-    return nearest[0] if len(nearest) == 1 else None
-
-
-def _difference(pairs: Sequence[tuple[RunRecord, RunRecord]]) -> str:
-    """What distinguishes the first of two runs on one object, in all pairs: its name, or its own settings."""
-    first = pairs[0][0]
-    if all(rival.given_name != run.given_name for run, rival in pairs):
-        return first.given_name
-    own = {key: run.settings[key] for run, rival in pairs for key in _differing(run.settings, rival.settings)}
-    return _first_few([f"{key.rsplit('.', 1)[-1]}={own[key]}" for key in sorted(own)]) or first.name
-
-
-def _differing(own: dict[str, str], other: dict[str, str]) -> list[str]:
-    return [key for key in own if other.get(key) != own[key] and not key.endswith(("name", "root"))]
-
-
-def _first_few(items: Sequence[str]) -> str:
-    more = [f"{len(items) - _KEYS_IN_NAMES} more"] if len(items) > _KEYS_IN_NAMES else []
-    return ", ".join([*items[:_KEYS_IN_NAMES], *more])
 
 
 def says(group: Group) -> list[str]:
@@ -296,9 +145,9 @@ def _notes(groups: Sequence[Group]) -> list[str]:
                 runs = ", ".join(kinds.values())
                 notes.append(f"{name}: runs were evaluated on different {what} and cannot be compared, as {runs}.")
     for group in groups:
-        own, *others = (_besides_object(same[0]) for same in group.about.values())
-        if differing := sorted({key for other in others for key in _differing(own, other)}):
-            notes.append(f"{group.label}: its settings are not the same on all objects ({_first_few(differing)}).")
+        own, *others = (besides_object(same[0]) for same in group.about.values())
+        if varied := sorted({key for other in others for key in differing(own, other)}):
+            notes.append(f"{group.label}: its settings are not the same on all objects ({first_few(varied)}).")
         notes += [f"{group.label}: {note}" for note in says(group)]
         for same in group.about.values():
             seeds = Counter(str(r.seed) for r in same if r.summary is not None)

@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from itertools import chain, zip_longest
 from typing import Any, Literal
 
+from gausim.report.gather.rows import FULL
 from gausim.report.gather.runs import NOT_RECORDED
 from gausim.report.gather.study import (
-    FULL,
     Group,
     Study,
     Value,

@@ -8,8 +8,9 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather import paper
+from gausim.report.gather.rows import FULL
 from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, effect, families, known, number
+from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, effect, families, known, number
 from gausim.report.tables.motion import bounce_sheets, diagnosis_sheets, horizon_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
