@@ -170,8 +170,7 @@ def test_a_tampered_file_is_refused_before_it_is_unpacked(published: Path, mirro
 
 
 @pytest.mark.parametrize(
-    ("name", "what"),
-    [("../../../escaped", "leaves the folder"), ("toy/readme", "expected a run, found none: config")],
+    ("name", "what"), [("../../../escaped", "leaves the folder"), ("toy/readme", "expected a run, found none: config")]
 )
 def test_a_hostile_archive_leaves_nothing(mirror: Path, name: str, what: str) -> None:
     with tarfile.open(mirror / "toy.tar", "w") as tar:

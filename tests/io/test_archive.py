@@ -66,14 +66,16 @@ def test_links_and_hidden_files_are_not_packed(tmp_path):
     ("members", "what"),
     [
         ([member("top/a"), member("../escaped")], "leaves the folder"),
-        ([member("top/a/../../../escaped")], "leaves the folder"),
-        ([member("top/link", tarfile.SYMTYPE, "/etc")], "'top/link' is a link or a device"),
-        ([member("top/hard", tarfile.LNKTYPE, "/etc/passwd")], "'top/hard' is a link or a device"),
         ([member("/tmp/escaped")], "leaves the folder"),
-        ([member("top/a"), member("top/a")], "damaged or unsafe"),
-        ([member("top/null", tarfile.CHRTYPE)], "'top/null' is a link or a device"),
-        ([member("top/a/b"), member("top/a")], "damaged or unsafe"),
-        ([member("top/a"), member("top/a/b")], "damaged or unsafe"),
+        ([member("top\\..\\..\\escaped")], "leaves the folder"),
+        ([member("C:/escaped")], "leaves the folder"),
+        ([member("top/link", tarfile.SYMTYPE, "/etc")], "a link"),
+        ([member("top/hard", tarfile.LNKTYPE, "/etc/passwd")], "a link"),
+        ([member("top/null", tarfile.CHRTYPE)], "a device"),
+        ([member("top/a"), member("top/A")], "there twice"),
+        ([member("top/a/b"), member("top/a")], "there twice"),
+        ([member("top/a"), member("top/a", tarfile.DIRTYPE)], "a folder where there is a file"),
+        ([member("top/a\x1b[2J")], "characters that no name"),
         ([member("top/" + str(i)) for i in range(5)], "more than the 20 bytes"),
     ],
 )
@@ -82,29 +84,26 @@ def test_hostile_members_are_refused_and_nothing_stays(tmp_path, members, what):
     (tmp_path / "inner").mkdir()
     with pytest.raises(FetchError, match=what):
         unpack(archive, tmp_path / "inner" / "to", most_bytes=20)
-    assert sorted(p.name for p in tmp_path.rglob("*")) == ["inner", "x.tar"]
-    assert not Path("/tmp/escaped").exists()
+    assert [p.name for p in tmp_path.rglob("*")] == ["x.tar", "inner"] or not list((tmp_path / "inner").iterdir())
+    assert not Path("/tmp/escaped").exists() and not (tmp_path / "escaped").exists()
 
 
-def test_a_link_of_a_zip_becomes_a_file_and_a_path_that_leaves_is_refused(tmp_path):
-    link = zipfile.ZipInfo("top/link")
-    link.external_attr = (stat.S_IFLNK | 0o777) << 16
-    with zipfile.ZipFile(tmp_path / "x.zip", "w") as made:
-        made.writestr(link, b"/etc")
-    unpack(tmp_path / "x.zip", tmp_path / "to", most_bytes=20)
-    assert (tmp_path / "to/top/link").read_bytes() == b"/etc" and not (tmp_path / "to/top/link").is_symlink()
-    with zipfile.ZipFile(tmp_path / "x.zip", "a") as made:
-        made.writestr("top/../../escaped", DATA)
-    with pytest.raises(FetchError, match="leaves the folder"):
-        unpack(tmp_path / "x.zip", tmp_path / "again", most_bytes=20)
-    assert not (tmp_path / "escaped").exists() and not (tmp_path / "again").exists()
+LINK = zipfile.ZipInfo("top/link")
+LINK.external_attr = (stat.S_IFLNK | 0o777) << 16
 
 
-def test_a_zip_that_unpacks_to_more_than_was_announced_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        (LINK, b"/etc/passwd", "'top/link' is a link"),
+        ("bomb", bytes(1 << 20), "more than the 1000 bytes that were announced"),
+    ],
+)
+def test_a_zip_may_hold_no_links_either_nor_lie_about_its_size(tmp_path, name, content, what):
     with zipfile.ZipFile(tmp_path / "x.zip", "w", zipfile.ZIP_DEFLATED) as made:
         made.writestr("top/good.txt", DATA)
-        made.writestr("bomb", bytes(1 << 20))
-    with pytest.raises(FetchError, match="more than the 1000 bytes that were announced"):
+        made.writestr(name, content)
+    with pytest.raises(FetchError, match=what):
         unpack(tmp_path / "x.zip", tmp_path / "to", most_bytes=1000)
     assert not (tmp_path / "to").exists()
 
@@ -139,6 +138,6 @@ def test_what_is_no_archive_or_breaks_off_is_said_to_be_none(tmp_path, data):
         big.size = 400
         data = tar_of(tmp_path / "x.tar", big).read_bytes()[:700]
     (tmp_path / "x.tar").write_bytes(data)
-    with pytest.raises(FetchError, match="expected a tar or zip archive .* damaged"):
+    with pytest.raises(FetchError, match="expected a tar or zip archive, found one that is damaged"):
         unpack(tmp_path / "x.tar", tmp_path / "to", most_bytes=1000)
     assert not (tmp_path / "to").exists()
