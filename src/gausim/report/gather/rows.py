@@ -121,7 +121,7 @@ def _distinct(names: Sequence[RowName], rows: Sequence[About]) -> list[RowName]:
 
     Of several full configurations, the reference of the ablations keeps the plain name.
     """
-    objects = [{name: same[0] for names, same in about.items() for name in names} for about in rows]
+    objects = [{o: same[0] for together, same in about.items() for o in together} for about in rows]
     taken = Counter((name, o) for name, own in zip(names, objects, strict=True) for o in own)
     plain = {_reference(name.family, names, [_first(about) for about in rows]) for name in names}
     result = []
