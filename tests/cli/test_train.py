@@ -131,6 +131,11 @@ def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str],
     assert "usage: gausim train" in capsys.readouterr().out
 
 
+def test_a_sweep_by_a_single_training_is_refused(arguments: list[str]) -> None:
+    with pytest.raises(ConfigError, match=r"learning_rates is several trainings\. Add -m"):
+        command.main([*arguments, "sweep=learning_rates"])
+
+
 @pytest.mark.usefixtures("again")
 def test_a_checkpoint_of_another_scene_is_refused(toy: Path, tmp_path: Path) -> None:
     other, scene = Path(shutil.copytree(toy, tmp_path / "other")), toy_scene()

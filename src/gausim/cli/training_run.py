@@ -18,7 +18,7 @@ from gausim.cli.output import end
 from gausim.cli.sweeps.jobs import do_job
 from gausim.compose.build import build, load_run
 from gausim.compose.config import instantiate, run_dir
-from gausim.compose.root import in_sweep
+from gausim.compose.root import chosen, in_sweep
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.pretraining import CorpusDataModule
@@ -60,6 +60,8 @@ def train(cfg: DictConfig) -> float | None:
     run = RunDirectory(run_dir())
     if in_sweep():
         return do_job(cfg, run, train_run)
+    if (sweep := chosen("sweep")) != "none":
+        raise ConfigError(f"sweep: {sweep} is several trainings. Add -m: gausim train -m sweep={sweep} ...")
     with run.writing():
         return train_run(cfg, run)
 
