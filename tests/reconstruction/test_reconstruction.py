@@ -272,6 +272,18 @@ def test_command_writes_scene_masks_figures_and_picture(stills: ImageSet, tmp_pa
     assert "holds none of" in capsys.readouterr().err
 
 
+def test_command_pins_below_the_height_that_the_data_set_states(stills: ImageSet, tmp_path: Path) -> None:
+    (tmp_path / "static").mkdir()
+    written(stills, tmp_path / "static", write_rgba)
+    facts = {"fps": 24, "views": ["a"], "train_views": ["a"], "heldout_views": [], "train_frames": [0, 16]}
+    (tmp_path / "dataset.json").write_text(json.dumps({**facts, "pinned_below_z": -0.2}))
+    command = ["reconstruct", str(tmp_path), "--kernels", "80", "--iterations", "20", "--video-share", "0"]
+    for given, height in (([], -0.2), (["--pin-below", "z=0.1"], 0.1)):
+        assert main([*command, *given]) == 0
+        scene = load_scene(tmp_path / "scene.ply")
+        assert torch.equal(scene.pinned, scene.means[:, 2] < height) and scene.pinned.any()
+
+
 def test_command_takes_photos_without_masks_as_a_scene(stills: ImageSet, tmp_path: Path, capsys) -> None:
     def without_alpha(path: Path, image: Tensor) -> None:
         assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., :3].flip(-1).numpy()))

@@ -162,6 +162,8 @@ def _inputs(
                 "--extent scene: a data set's sequences show an object. Take the transforms.json of stills."
             )
         data = ObjectData(source.parent)
+        if data.pinned_below_z is not None and not (arguments.pin_below or arguments.pin_above):
+            arguments.pin_below = f"z={data.pinned_below_z}"
         return data.name, gather_object(data, video_fraction=arguments.video_share), _cloud(arguments.points)
     material = gather_stills(
         source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse

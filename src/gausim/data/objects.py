@@ -30,6 +30,7 @@ class _Facts(Struct):
     # The first frame and the first unseen one.
     train_frames: tuple[Annotated[int, Meta(ge=0, le=0)], Annotated[int, Meta(ge=2, le=1 << 31)]]
     name: str = ""
+    pinned_below_z: float | None = None
 
 
 class ReservedPart(Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,6 +82,7 @@ class ObjectData:
         train_views: cameras to train on.
         heldout_views: cameras never trained on.
         train_frames: the frames that training may see, e.g. range(0, 16).
+        pinned_below_z: a reconstruction pins the kernels below this height [scene units]; None where not stated.
         facts: all other entries of ``dataset.json``.
         surroundings: what acts on the body besides its own elasticity.
         scene_path, masks_path: files of the rest scene and its masks; without the second the one beside the PLY.
@@ -118,7 +120,7 @@ class ObjectData:
         found = checked(self.facts, _Facts, str(path), "Correct the field.")
         self.name, self.fps = found.name or self.root.name, found.fps
         self.views, self.train_views, self.heldout_views = found.views, found.train_views, found.heldout_views
-        self.train_frames = range(*found.train_frames)
+        self.train_frames, self.pinned_below_z = range(*found.train_frames), found.pinned_below_z
         self.surroundings, self._grip = read_surroundings(self.facts, str(path))
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
