@@ -21,6 +21,7 @@ from gausim.data import records
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData, reserved_part
 from gausim.doctor.examine import examine
+from gausim.metrics import image
 from gausim.results.looks import read_looks
 
 RESERVED = "data.test={sequences: [seq_001]}"
@@ -117,13 +118,18 @@ def test_declarations(toy: Path, tmp_path: Path) -> None:
         reserved_part({"seeds": "all"}, "data.test")
 
 
-def test_looks_are_declared_counted_and_said(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_looks_are_declared_counted_and_said(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert evaluate.main([str(run)]) == 0  # the development part
     found = json.loads((run / "evaluation" / "metrics.json").read_text())
     assert found["objects"]["toy"]["sequences"] == ["seq_000"] and found["run"]["part"] == "development"
     assert not (run / "evaluation" / "test.json").exists()
     with pytest.raises(ConfigError, match=r"--test: expected the number of trials.*--trials N.*protocol\.trials"):
         evaluate.main([str(run), "--test"])
+    with monkeypatch.context() as patch, pytest.raises(ConfigError, match="pip install flip-evaluator"):
+        patch.setattr(image, "find_spec", lambda name: None)
+        evaluate.main([str(run), "--test", "--trials", "5", "--flip"])  # refused before the look is counted
     with pytest.raises(DataError, match=r"\['seq_001'\] belong to the test part, which is evaluated with --test"):
         evaluate.main([str(run), "--sequences", "seq_001"])
     with pytest.raises(DataError, match="belongs to the test part"):

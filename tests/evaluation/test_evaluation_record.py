@@ -16,10 +16,8 @@ from helpers import toy_object
 import gausim
 from gausim.core import Rendered
 from gausim.data.objects import ObjectData
-from gausim.evaluation import evaluation
 from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
 from gausim.evaluation.recorder import PictureRecorder
-from gausim.metrics import image as flip
 from gausim.metrics.lpips import expected_shapes
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.pictures import load_pictures
@@ -43,8 +41,7 @@ class Oracle:
         return self.toy.truth(record.name)
 
 
-def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "flip_is_installed", lambda: False)  # it takes half of the time
+def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     methods = {"oracle": Oracle(toy), "bare": lambda record: toy.truth(record.name)}
     curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer())
     summary = write_evaluation(tmp_path, [curves], {"name": "toy"})
@@ -61,20 +58,27 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path, 
     assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
     difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
     assert pictures.truth.shape == (10, 3, 32, 32, 4) and np.abs(difference).max() <= 2
-    assert pictures.background is None and entry["absent"] == {"flip": "no package", "lpips": "no weights"}
+    assert pictures.background is None and entry["absent"] == {"lpips": "no weights"}
 
 
 def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
     from safetensors.torch import save_file
 
-    pytest.importorskip("flip_evaluator")
-    assert [m.key for m in default_metrics()] == ["l2", "l2_foreground", "psnr", "psnr_foreground", "ssim", "flip"]
+    assert [m.key for m in default_metrics()] == ["l2", "l2_foreground", "psnr", "psnr_foreground", "ssim"]
     save_file({n: torch.ones(s) for n, s in expected_shapes().items()}, tmp_path / "w.safetensors")
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "w.safetensors"))
     assert [m.key for m in default_metrics()][-1] == "lpips" and absent_metrics(31) == {}
-    assert absent_metrics(30) == {"lpips": "images under 31 pixels"} and len(default_metrics(30)) == 6
-    monkeypatch.setattr(flip, "find_spec", lambda name: None)
-    assert absent_metrics(31) == {"flip": "no package"} and len(default_metrics(31)) == 6
+    assert absent_metrics(30) == {"lpips": "images under 31 pixels"} and len(default_metrics(30)) == 5
+
+
+def test_flip_is_measured_where_it_is_wanted(toy):
+    pytest.importorskip("flip_evaluator")
+    methods = {"oracle": Oracle(toy)}
+    curves = evaluate_object(
+        ObjectData(toy.root), toy.scene, methods, ReferenceRenderer(), sequences=["seq_000"], views=["cam_2"], flip=True
+    )
+    found = {row: rows["flip"] for row, rows in curves.values.items() if "flip" in rows}
+    assert found["oracle"].max() < 0.02 < found["static"].max()
 
 
 def test_the_first_sequence_warms_up(monkeypatch):

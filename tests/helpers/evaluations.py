@@ -1,14 +1,12 @@
-"""Evaluations without what takes most of their time."""
+"""Predictions without what takes most of their time."""
 
 from __future__ import annotations
 
 import pytest
 
-from gausim.evaluation import evaluation
 from gausim.runs import cost
 
 
 def make_quick(patch: pytest.MonkeyPatch) -> None:
-    """FLIP takes half of an evaluation, and collecting garbage before the memory is counted most of a prediction."""
-    patch.setattr(evaluation, "flip_is_installed", lambda: False)
+    """Collecting garbage before the memory is counted takes most of a prediction."""
     patch.setattr(cost, "_begin", lambda cuda: None)

@@ -29,6 +29,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--trials", type=positive, metavar="N", help="with --test: trials made of the method on the development part "
         "(default: protocol.trials of the run)")  # fmt: skip
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
+    add("--flip", action="store_true", help="also measure FLIP (extra `flip`), in as much time as all other metrics")
     add_data_option(parser)
     add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/evaluation, or RUN/evaluation/partial "
         "for a part")  # fmt: skip

@@ -18,7 +18,7 @@ from gausim.compose.predict import TrainedPrediction, endurance, run_objects, sc
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
-from gausim.evaluation.evaluation import evaluate_object, write_evaluation
+from gausim.evaluation.evaluation import default_metrics, evaluate_object, write_evaluation
 from gausim.report.pictures.figures import diagnosis_figure, endurance_figure, error_figure
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
@@ -33,6 +33,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     """Measures a run by the options of the command; returns the exit status."""
     if is_pretrained(arguments.run):
         return _evaluate_bodies(arguments)
+    default_metrics(flip=arguments.flip)  # before a look is counted, refuses what is not installed
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
     part, sequences = _choose(run, arguments)
@@ -70,10 +71,10 @@ def evaluate(arguments: argparse.Namespace) -> int:
 def _evaluate_bodies(arguments: argparse.Namespace) -> int:
     """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
     parts = arguments.object or arguments.sequences or arguments.views != "all" or arguments.test
-    if parts or arguments.endurance is not None:
+    if parts or arguments.flip or arguments.endurance is not None:
         raise ConfigError(
             f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, "
-            "--sequences, --views, --test and --endurance."
+            "--sequences, --views, --test, --flip and --endurance."
         )
     folder = arguments.out or arguments.run / "evaluation"
     module, data = load_corpus_run(arguments.run, data=data_option(arguments.data))
@@ -109,6 +110,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str
                 run.renderer,
                 sequences=sequences[item.data.name],
                 views=_views(item.data, arguments.views),
+                flip=arguments.flip,
                 advance=advance,
             )
             for item in items

@@ -26,7 +26,6 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.evaluation.recorder import PictureRecorder
 from gausim.evaluation.references import Bounces, Reference
-from gausim.metrics.image import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (
@@ -64,21 +63,21 @@ MASK_IOU = ImageMetricInfo(IOU, "mask IoU", 1.0, "", higher_is_better=True)
 PIXELS_AT_ONCE = 1 << 20
 
 
-def default_metrics(side: int = SMALLEST) -> list[metrics.ImageMetric]:
-    """The image metrics of tables for images of ``side`` pixels, with FLIP and LPIPS where they are available."""
-    absent = absent_metrics(side)
-    optional = [kind() for kind in (metrics.FLIP, metrics.LPIPS) if kind.key not in absent]
+def default_metrics(side: int = SMALLEST, *, flip: bool = False) -> list[metrics.ImageMetric]:
+    """The image metrics of tables for images of ``side`` pixels, with LPIPS where it is available.
+
+    Raises:
+        ConfigError: FLIP is wanted and not installed.
+    """
     basic = (metrics.L2, metrics.ForegroundL2, metrics.PSNR, metrics.ForegroundPSNR, metrics.SSIM)
-    return [*(kind() for kind in basic), *optional]
+    optional = [metrics.FLIP] * flip + [metrics.LPIPS] * (not absent_metrics(side))
+    return [kind() for kind in (*basic, *optional)]
 
 
 def absent_metrics(side: int) -> dict[str, str]:
-    """Reasons by key why FLIP or LPIPS cannot be computed on images of ``side`` pixels."""
-    reasons = {
-        metrics.FLIP.key: "" if flip_is_installed() else NO_PACKAGE,
-        metrics.LPIPS.key: TOO_SMALL if side < SMALLEST else "" if weights_path().is_file() else NO_WEIGHTS,
-    }
-    return {key: reason for key, reason in reasons.items() if reason}
+    """Reason by key why LPIPS cannot be computed on images of ``side`` pixels; empty where it can."""
+    reason = TOO_SMALL if side < SMALLEST else "" if weights_path().is_file() else NO_WEIGHTS
+    return {metrics.LPIPS.key: reason} if reason else {}
 
 
 def evaluate_object(
@@ -89,19 +88,21 @@ def evaluate_object(
     *,
     sequences: Sequence[str] | None = None,
     views: Sequence[str] | None = None,
+    flip: bool = False,
     advance: Callable[[str], None] | None = None,
 ) -> ObjectCurves:
     """Per-frame figures of every method (a prediction by its row) and reference on every sequence of an object.
 
-    The rest scene has all kernels of the trajectories. Sequences and views are all, unless named; ``advance`` is
-    called with a sequence's name when it is done.
+    The rest scene has all kernels of the trajectories. Sequences and views are all, unless named; ``flip`` measures
+    FLIP, too, in as much time as everything else. ``advance`` is called with a sequence's name when it is done.
 
     Raises:
+        ConfigError: FLIP is wanted and not installed.
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
     records = _chosen(data, sequences)  # before the measure, which reads the true motion of all
-    measure = _ObjectMeasure(data, scene, methods, renderer, views)
+    measure = _ObjectMeasure(data, scene, methods, renderer, views, flip=flip)
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
@@ -168,11 +169,13 @@ class _ObjectMeasure:
         methods: Mapping[str, Predict],
         renderer: Renderer,
         views: Sequence[str] | None,
+        *,
+        flip: bool,
     ) -> None:
         self.data, self.scene, self.methods, self.renderer = data, scene, methods, renderer
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-        self.metrics, self._absent = default_metrics(side), absent_metrics(side)
+        self.metrics, self._absent = default_metrics(side, flip=flip), absent_metrics(side)
         self.reference, self._bounces = Reference(data, scene), Bounces(data)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points

@@ -19,9 +19,6 @@ SMALLEST_MSE = 1e-10
 # Window of SSIM, with a Gaussian of sigma 1.5 as in the original definition and papers on 3DGS. The training loss uses
 # window 5: a metric for the comparison of methods should not be the loss of one of them.
 WINDOW = 11
-NO_PACKAGE = "no package"
-# Note under tables without FLIP.
-NO_FLIP = "FLIP was not measured: `pip install flip-evaluator`; then evaluate again."
 Images = Float[Tensor, "B H W 3"]
 Mask = Bool[Tensor, "B H W"]
 PerImage = Float[Tensor, " B"]
@@ -124,11 +121,6 @@ class SSIM(ImageMetric):
         return kornia.metrics.ssim(first, second, WINDOW).mean((1, 2, 3))
 
 
-def flip_is_installed() -> bool:
-    """Whether the package that computes FLIP is installed (`flip-evaluator`, extra ``flip``)."""
-    return find_spec("flip_evaluator") is not None
-
-
 class FLIP(ImageMetric):
     """Mean over pixels of the perceived difference of two images shown alternately (Andersson et al. 2020), 0 to 1.
 
@@ -142,8 +134,8 @@ class FLIP(ImageMetric):
 
     def __init__(self) -> None:
         super().__init__()
-        if not flip_is_installed():
-            raise ConfigError(NO_FLIP)
+        if find_spec("flip_evaluator") is None:
+            raise ConfigError("FLIP is not installed. `pip install flip-evaluator`.")
 
     def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """Mean over the whole image."""

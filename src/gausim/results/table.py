@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from gausim.metrics.image import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.results.curves import ERROR_3D, STATIC, TRACK_ERROR
 from gausim.results.summary import MOTION_ENERGY, dig
@@ -163,8 +162,7 @@ def footnotes(entry: dict[str, Any], method: str) -> list[str]:
 def gaps(summary: dict[str, Any]) -> list[str]:
     """Metrics that no table of an evaluation has, and how to get them, in sentences."""
     absent = [found for entry in summary["objects"].values() if isinstance(found := entry.get("absent"), dict)]
-    remedies = {("flip", NO_PACKAGE): NO_FLIP, ("lpips", NO_WEIGHTS): NO_LPIPS}
-    return [remedy for (key, why), remedy in remedies.items() if any(found.get(key) == why for found in absent)]
+    return [NO_LPIPS] if any(found.get("lpips") == NO_WEIGHTS for found in absent) else []
 
 
 def markdown_table(table: Table) -> str:
