@@ -93,15 +93,21 @@ class Springs(nn.Module):
         For one and the same state without damping this is the change of the stiffness from rest to it. Compressed
         springs (t < 0) buckle; for them t I is left out, so that this matrix is positive semi-definite then.
         """
-        length, tension = (first.length + second.length) / 2, _tension(first, second, damping)
+        k, length = factor * self.stiffness, (first.length + second.length) / 2
         middle = (first.change + second.change) / 2 + self.offset
-        towards, rest = (second.change + self.offset) / second.length[..., None], self.offset / self.length[:, None]
-        t = tension / length
-        grown = ((1 + 2 * damping - t) / length)[..., None] * middle
-        blocks = grown[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
-        blocks = blocks + t.clamp_min(0)[..., None, None] * torch.eye(3, dtype=t.dtype, device=t.device)
-        turned = ((factor * self.stiffness)[:, None, None] * blocks) @ self.modes.unflatten(0, (-1, 3))
-        return self.modes.mT @ turned.flatten(-3, -2)
+        t = _tension(first, second, damping) / length
+        grown = (k * (1 + 2 * damping - t) / length)[..., None] * middle
+        towards = self._along((second.change + self.offset) / second.length[..., None])
+        rest = self._along(self.offset / self.length[:, None])
+        turned = grown[..., None] * towards[..., None, :]
+        turned = turned.addcmul_((k * t.clamp_min(0))[..., None, None], self.modes.unflatten(0, (-1, 3)))
+        return self.modes.mT @ turned.flatten(-3, -2) - rest.mT @ (k[:, None] * rest)
+
+    def _along(self, direction: Float[Tensor, "*S E 3"]) -> Float[Tensor, "*S E M"]:
+        """Products of a direction per spring with its modes."""
+        x, y, z = (d[..., None] for d in direction.unbind(-1))
+        modes = self.modes.unflatten(0, (-1, 3)).unbind(1)
+        return torch.addcmul(torch.addcmul(x * modes[0], y, modes[1]), z, modes[2])
 
     def between(
         self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0
