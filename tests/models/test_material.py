@@ -106,7 +106,7 @@ def test_without_drag_training_adds_none(hierarchy) -> None:
     slopes = [attributes.grad, *(p.grad for p in template.parameters() if p.grad is not None)]
     assert all(torch.isfinite(slope).all() for slope in slopes)
     assert template.damping.grad[0] == 0 != template.damping.grad[1]
-    units = mock.Mock(attributes=attributes.detach(), log_density=density)
+    units = mock.Mock(spec=FixedUnits, attributes=attributes.detach(), log_density=density)
     assert set(template.material(0, units, 24.0)) == {"density", "stiffness"}
     with pytest.raises(ConfigError, match=r"damping.drag is 0"):
         _ = template.log_drag

@@ -202,7 +202,7 @@ class Pointer:
             found = self._hand[self._pins == index - len(self._movable)]
             return int(found[0]) if len(found) else -1
         eye = vector(event.client.camera.position)
-        kernel = first_hit(page, self._reach, eye, point - eye, self._free | (self._hand >= 0))
+        kernel = first_hit(page, self._reach, eye.tolist(), (point - eye).tolist(), self._free | (self._hand >= 0))
         return -1 if kernel is None else int(self._hand[kernel])
 
     def _drag_hand(self, grab: _Grab, event: Any) -> None:
