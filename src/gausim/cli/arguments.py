@@ -42,11 +42,14 @@ def add_pin_options(parser: argparse.ArgumentParser) -> None:
     add("--pin-above", metavar="AXIS=VALUE", help="pin kernels whose coordinate is above (scenes with up = -y)")
 
 
-def pinned_by(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
-    """The scene with its pins replaced by the union of --pin-below and --pin-above, if given."""
+def pinned_by(scene: GaussianScene, arguments: argparse.Namespace, *, below_z: float | None = None) -> GaussianScene:
+    """The scene with its pins replaced by the union of --pin-below and --pin-above, else by those below a height."""
     from gausim.ops.selection import apply_masks, parse_half_space
 
-    sides = ((arguments.pin_below, False), (arguments.pin_above, True))
+    below, above = arguments.pin_below, arguments.pin_above
+    if below_z is not None and not (below or above):
+        below = f"z={below_z}"
+    sides = ((below, False), (above, True))
     chosen = [parse_half_space(text, above=above) for text, above in sides if text]
     return apply_masks(scene, pinned=chosen[0] | chosen[-1]) if chosen else scene
 

@@ -18,7 +18,8 @@ from gausim.compose.predict import TrainedPrediction, endurance, run_objects, sc
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
-from gausim.evaluation.evaluation import default_metrics, evaluate_object, write_evaluation
+from gausim.evaluation.evaluation import evaluate_object, write_evaluation
+from gausim.metrics import FLIP
 from gausim.report.pictures.figures import diagnosis_figure, endurance_figure, error_figure
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
@@ -33,7 +34,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
     """Measures a run by the options of the command; returns the exit status."""
     if is_pretrained(arguments.run):
         return _evaluate_bodies(arguments)
-    default_metrics(flip=arguments.flip)  # before a look is counted, refuses what is not installed
+    if arguments.flip:
+        FLIP()  # where it is not installed it is refused before a look is counted
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
     part, sequences = _choose(run, arguments)

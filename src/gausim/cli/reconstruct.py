@@ -75,11 +75,11 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
-    name, material, cloud = _inputs(source, arguments, options)
+    name, material, cloud, below_z = _inputs(source, arguments, options)
     renderer = CpuRenderer() if arguments.renderer == "cpu" else ReferenceRenderer()
     start = time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
-    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments)
+    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments, below_z=below_z)
     seconds = time.process_time() - start
     save_scene(scene, out)
     record = {
@@ -146,7 +146,8 @@ def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
 
 def _inputs(
     source: Path, arguments: argparse.Namespace, options: ReconstructionOptions
-) -> tuple[str, Material, PointCloud | None]:
+) -> tuple[str, Material, PointCloud | None, float | None]:
+    """Name, images, points to begin with, and the height below which the data set has its pins."""
     from gausim.data.objects import ObjectData
     from gausim.reconstruction.stills import gather_object, gather_stills
 
@@ -162,15 +163,14 @@ def _inputs(
                 "--extent scene: a data set's sequences show an object. Take the transforms.json of stills."
             )
         data = ObjectData(source.parent)
-        if data.pinned_below_z is not None and not (arguments.pin_below or arguments.pin_above):
-            arguments.pin_below = f"z={data.pinned_below_z}"
-        return data.name, gather_object(data, video_fraction=arguments.video_share), _cloud(arguments.points)
+        material = gather_object(data, video_fraction=arguments.video_share)
+        return data.name, material, _cloud(arguments.points), data.pinned_below_z
     material = gather_stills(
         source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
     )
     beside = source.parent / "points.npz"
     points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
-    return source.parent.name or "scene", material, _cloud(points)
+    return source.parent.name or "scene", material, _cloud(points), None
 
 
 def _cloud(path: str | None) -> PointCloud | None:

@@ -272,7 +272,7 @@ class Pointer:
 
 
 def vector(numbers: Iterable[float]) -> Float[Tensor, " 3"]:
-    """A point or direction of the page as the browser, numpy or torch gives it."""
+    """A point or direction of the page as the browser or numpy gives it."""
     return torch.tensor([float(number) for number in numbers])
 
 
