@@ -38,19 +38,6 @@ def named_bar(total: int, title: str) -> Iterator[Callable[[str], None]]:
         yield lambda name: shown.update(task, advance=1, description=f"{title}: {name}")
 
 
-@contextmanager
-def byte_bar(total: int, title: str, *, pieces: bool = False) -> Iterator[Callable[[int], None]]:
-    """A bar of ``total`` bytes; yields a function of the bytes so far, or of each piece with ``pieces``."""
-    from rich.progress import DownloadColumn, TransferSpeedColumn
-
-    with bars(DownloadColumn(), TransferSpeedColumn()) as shown:
-        task = shown.add_task(title, total=total)
-        if pieces:
-            yield lambda count: shown.advance(task, count)
-        else:
-            yield lambda count: shown.update(task, completed=count)
-
-
 def end(sentences: Sequence[str], kind: str, address: Path, *commands: Sequence[object]) -> None:
     """Prints the result in at most three lines, its address, and the next commands, as arguments of gausim.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 from gausim.core.errors import ConfigError, DataError
 from gausim.runs.names import CONFIG
 
-# Folder in a packed run for rest scenes from outside its data set; source of a directory that `gausim fetch` made.
-SCENES, FETCHED = "scenes", "FETCHED"
+# Folder in a packed run for rest scenes from outside its data set.
+SCENES = "scenes"
 _FILES = ("scene", "masks")
 
 
@@ -107,21 +106,10 @@ def _placed(run_dir: Path, entry: Mapping[str, Any], field: str) -> dict[str, An
 
 
 def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> str:
-    fetched = _fetched_with(run_dir)
-    first = f" `gausim fetch {fetched}` fetches the data set that it was trained on." if fetched else ""
     key, value = option.removeprefix("--data ").partition("=")[::2]
     setting = f"data.{key}={value}" if value else "data.root=DIR"
     return (
-        f"{run_dir / CONFIG}: field {field} names {path}, expected {kind}, found none on this machine.{first} Give it "
+        f"{run_dir / CONFIG}: field {field} names {path}, expected {kind}, found none on this machine. Give it "
         f"with {option} (evaluate, simulate, export, view), as {setting} to a training by this configuration, or write "
         "its path into that field."
     )
-
-
-def _fetched_with(run_dir: Path) -> str | None:
-    """Registry entry of the data set of a fetched run, if any."""
-    try:
-        found = json.loads((run_dir / FETCHED).read_text())["data"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return found if isinstance(found, str) and found.isprintable() and found else None

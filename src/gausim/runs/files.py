@@ -21,8 +21,8 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCE
 
 
 @contextmanager
-def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
-    """Locks a directory by a file in it until the block or the process ends; ``doing`` is told to other processes.
+def sole_writer(lock: Path) -> Iterator[None]:
+    """Locks a directory by a file in it until the block or the process ends.
 
     Raises:
         BusyError: another process has locked the directory.
@@ -35,7 +35,7 @@ def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise BusyError(
-                f"{lock.parent}: another process ({file.read().strip() or 'unknown'}) is {doing}. Wait for it or "
+                f"{lock.parent}: another process ({file.read().strip() or 'unknown'}) is training here. Wait for it or "
                 "end it; then the same command continues."
             ) from error
         except OSError as error:
