@@ -21,7 +21,7 @@ from helpers.simulators import gausim
 # The settings of `model=gausim`, small.
 NEURAL = {
     "template": partial(
-        MaterialTemplate, modes=9, solid=SolidSettings(0.2, held_inside=True), links=4, finite_strain=True, hidden=8
+        MaterialTemplate, modes=9, solid=SolidSettings(0.2, held_inside=True), links=4, hidden=8
     ),
     "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
     "body_frame": True, "edges": "rest", "attributes": 3,

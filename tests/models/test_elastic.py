@@ -140,7 +140,7 @@ def test_parameters_are_grouped_by_role() -> None:
     groups = model.parameter_groups()
     ids = [id(p) for group in groups.values() for p in group]
     assert len(ids) == len(set(ids)) and set(ids) == {id(p) for p in model.parameters()}
-    assert any(p is model.template.scenes[1].mixing for p in groups["template"])
+    assert any(p is model.template.scenes[1].mixing for p in groups["matrices"])
     assert any(p is model.attributes[1] for p in groups["scene"])
 
 

@@ -79,7 +79,7 @@ def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
         inertia += rho[i] * own
         drag += 2 * rho[i] * lost[i] * own
     for e in range(body.springs.ends.shape[1]):
-        stretch = 0.3 * links[e, 0].exp() + 0.15 * links[e, 2].exp()
+        stretch = 0.3 * links[e, 0].exp()
         stiffness += stretch * torch.outer(body.stretch[e], body.stretch[e])
         tied = 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
         inertia, drag = inertia + tied, drag + lost[body.springs.ends[:, e]].sum() * tied
@@ -92,10 +92,68 @@ def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
     assert 0 < int((slowed > 0).sum()) < 9
     rate = drag.trace() / inertia.trace()
     torch.testing.assert_close(found.damping, drag + rate * slowed.diag() + (c1 + rate / 4) * k * stiffness)
-    torch.testing.assert_close(found.springs, 0.15 * k * links[:, 2].exp())
+    assert not found.springs.any()
     torch.testing.assert_close(found.units, k * units[:, :2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
+
+
+def _own(template: MaterialTemplate, *, size: float) -> None:
+    """Trains the own matrices of scene 0, at random."""
+    generator = torch.Generator().manual_seed(6)
+    for weight in template.scenes[0].parameters():
+        weight.copy_(size * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
+
+
+def test_own_matrices_are_factors_on_the_decoded_ones(hierarchy) -> None:
+    decoded = _template(hierarchy).matrices(0, *_material(hierarchy), 1 / 24)
+    template, material = _template(hierarchy, own_matrices=True), _material(hierarchy)
+    found = template.matrices(0, *material, 1 / 24)
+    for name in ("stiffness", "mass", "inertia", "damping"):
+        torch.testing.assert_close(getattr(found, name), getattr(decoded, name))
+    assert float(template.mixing(0)) == 0
+    _own(template, size=1.0)
+    found, own = template.matrices(0, *material, 1 / 24), template.scenes[0]
+    eye = torch.eye(9, dtype=torch.float64)
+    heavy, mixed = eye + 0.3 * own.inertia_mixing, eye + 0.3 * own.stiffness_mixing
+    root = torch.linalg.cholesky(decoded.stiffness)
+    inner = root @ mixed @ (2 * own.stiffness).exp().diag() @ mixed.mT @ root.mT
+    torch.testing.assert_close(found.stiffness, heavy.mT @ inner @ heavy)
+    torch.testing.assert_close(found.mass, heavy.mT @ decoded.mass @ heavy)
+    for matrix in (found.stiffness, found.mass, found.inertia, found.damping):
+        least = torch.linalg.eigvalsh(matrix)
+        assert float(least[0]) > -1e-9 * float(least[-1])
+    mixings = (own.stiffness_mixing, own.damping_mixing, own.inertia_mixing)
+    assert float(template.mixing(0)) == pytest.approx(sum(float((0.3 * m).square().sum()) for m in mixings))
+
+
+@pytest.mark.parametrize("law", ["solid", "springs"])
+def test_a_step_of_own_matrices_adds_no_energy_and_trains_them(hierarchy, law: str) -> None:
+    template = _template(hierarchy, own_matrices=True, law=law)
+    _own(template, size=0.2)
+    template.requires_grad_(True)
+    part = PreparedMaterial(template.body(0), template.matrices(0, *_material(hierarchy), 1 / 24), 1.0)
+    part.corrections = 30
+    now = 0.02 * torch.randn(1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    before, energies = now, []
+    for _ in range(20):
+        energies.append(float(part.energy(now, before).detach()))
+        now, before = part.after(now, before), now
+    assert max(energies) <= energies[0] * (1 + 1e-6) and energies[-1] < energies[0]
+    now.square().sum().backward()
+    for name, weight in template.scenes[0].named_parameters():
+        assert torch.isfinite(weight.grad).all() and weight.grad.any(), name
+
+
+def test_own_matrices_belong_to_their_scene() -> None:
+    template = partial(NEURAL["template"], own_matrices=True)
+    model = make_model([make_scene(90), make_scene(90, seed=1)], **(NEURAL | {"template": template}))
+    assert model.own(1)[-1] == "template.scenes.1." and not any("scenes" in name for name in model.shared())
+    groups = model.parameter_groups()
+    assert len(groups["matrices"]) == 10 and sum(map(len, groups.values())) == len(list(model.parameters()))
+    model.freeze()
+    assert all(p.requires_grad for p in groups["matrices"]) and not any(p.requires_grad for p in groups["template"])
+    assert {"network", "template"} == set(model.shared_groups)
 
 
 def test_without_drag_training_adds_none(hierarchy) -> None:
@@ -130,7 +188,7 @@ def test_wrong_damping_is_refused(hierarchy, wrong: Damping) -> None:
 @pytest.mark.parametrize("finite", [True, False])
 def test_cells_or_springs_are_what_is_nonlinear(hierarchy, finite: bool) -> None:
     """In the state z each pulls by minus the slope of its own energy, as strong as K says that it is."""
-    template = _template(hierarchy, finite_strain=finite, links=Links(4, damping=0.1))
+    template = _template(hierarchy, law="solid" if finite else "springs", links=Links(4, damping=0.1))
     body, matrices = template.body(0), template.matrices(0, *_material(hierarchy), 1 / 48)
     part = PreparedMaterial(body, matrices, 1.0)
     z = 0.1 * torch.randn(1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -163,7 +221,7 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
 @pytest.mark.parametrize("frames", [24, 48])
 def test_an_even_drag_damps_all_modes_alike_however_fast_and_strong_it_is(hierarchy, frames: int) -> None:
     """Amplitudes fall as exp(-c t / 2): the product of the two roots of a mode's step is exp(-c) a frame."""
-    template, free = _template(hierarchy, links=Links(springs=0.0)), hierarchy.levels[1].count
+    template, free = _template(hierarchy), hierarchy.levels[1].count
     for weight in (*template.unit_decoder.parameters(), *template.link_decoder.parameters()):
         weight.zero_()
     template.damping[1] = -np.inf  # no viscosity
@@ -237,11 +295,11 @@ def test_network_sees_the_middle_of_the_step() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_small_motions_grow_less_where_the_network_sees_the_middle_of_the_step(seed: int) -> None:
-    strong = {"output_scale": 10.0, "seed": seed}
+    strong = {"output_scale": 15.0, "seed": seed}
     at_the_start, in_the_middle = (
         largest_eigenvalue(neural_model(centred=centred, **strong), 0) for centred in (False, True)
     )
-    assert in_the_middle < min(at_the_start, 1.0)
+    assert in_the_middle < at_the_start
 
 
 def _moved(scene, turn, shift):

@@ -14,7 +14,7 @@ from torch.optim import Adam, Optimizer
 
 from gausim.core import ConfigError
 
-GROUPS = ("network", "scene", "template", "initial")
+GROUPS = ("network", "scene", "template", "matrices", "initial")
 
 
 @runtime_checkable
@@ -101,6 +101,7 @@ class OptimizerSettings:
     network_lr: float = 8e-4
     scene_lr: float = 8e-4
     template_lr: float | None = None
+    matrices_lr: float | None = None
     initial_lr: float = 8e-4
     schedule: Schedule | None = None
     clip_norm: float = 1.0
@@ -121,12 +122,13 @@ class OptimizerSettings:
             raise ConfigError(f"optimizer.decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}.")
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
-        """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
+        """The optimiser over the named groups of :data:`GROUPS`.
 
         A parameter that a batch does not use has no loss gradient, and the optimiser skips it and its momentum.
         """
         template = self.scene_lr if self.template_lr is None else self.template_lr
-        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, self.initial_lr), strict=True))
+        matrices = template if self.matrices_lr is None else self.matrices_lr
+        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, matrices, self.initial_lr), strict=True))
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
             parts: dict[float, list[Parameter]] = {0.0: []}  # parameters without decay come first

@@ -29,7 +29,7 @@ def load_shared(simulator: GausSim, run_dir: Path | str, model: Mapping[str, Any
         ConfigError: the networks' shapes differ; nothing was loaded.
     """
     there, _ = _read(run_dir)
-    shared = tuple(f"{name}." for name in simulator.shared())
+    shared = simulator.shared()
     found, own = (
         {name: value for name, value in weights.items() if name.startswith(shared)}
         for weights in (there, simulator.state_dict())
@@ -49,7 +49,7 @@ def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, 
         ConfigError: the weights' shapes differ; nothing was loaded.
     """
     there, trained = _read(run_dir)
-    shared = tuple(f"{name}." for name in simulator.shared())
+    shared = simulator.shared()
     found = {name: value for name, value in there.items() if name.startswith(shared)}
     for scene_id, scene in enumerate(fingerprints(simulator.scenes)):
         if scene not in trained:

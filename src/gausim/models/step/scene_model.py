@@ -237,21 +237,23 @@ class SceneModel(nn.Module, ABC):
         return {name: Property(of_kernels(found.values), found.text) for name, found in known.items()}
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by role: the network, the scenes' densities and attributes, and the template."""
+        """Parameters by role: the network, densities and attributes, and the template's, shared or of scenes."""
+        named, shared = dict(self.template.named_parameters()), self.template.shared("")
         return {
             "network": list(self.predictor.parameters()),
             "scene": [*self.log_density, *self.attributes, *self.surroundings.parameters()],
-            "template": list(self.template.parameters()),
+            "template": [p for name, p in named.items() if name.startswith(shared)],
+            "matrices": [p for name, p in named.items() if not name.startswith(shared)],
         }
 
     @property
     def shared_groups(self) -> tuple[str, ...]:
         """Those of :meth:`parameter_groups` that all scenes have in common."""
-        return ("network", "template") if self.template.is_shared else ("network",)
+        return "network", "template"
 
-    def shared(self) -> dict[str, nn.Module]:
-        """Modules common to all scenes, by name: the predictor with its statistics, and a shared template."""
-        return {"predictor": self.predictor, **({"template": self.template} if self.template.is_shared else {})}
+    def shared(self) -> tuple[str, ...]:
+        """Prefixes of the names of what all scenes have in common: predictor, statistics of its inputs, decoders."""
+        return "predictor.", *self.template.shared("template.")
 
     def own(self, scene_id: int) -> tuple[str, ...]:
         """Prefixes of the names of a scene's parameters and buffers in the state dict."""
@@ -259,13 +261,14 @@ class SceneModel(nn.Module, ABC):
         return *own, *self.template.own(scene_id, "template.")
 
     def freeze(self, *, scenes: bool = False) -> None:
-        """Freezes the modules of :meth:`shared`: their weights and the statistics of the normalisers.
+        """Freezes what :meth:`shared` names: weights, and the statistics of the normalisers.
 
         Args:
             scenes: also freeze the parameters of the scenes.
         """
-        for module in (self,) if scenes else self.shared().values():
-            module.requires_grad_(False)
+        for name, parameter in self.named_parameters():
+            if scenes or name.startswith(self.shared()):
+                parameter.requires_grad_(False)
         for normaliser in normalisers_of(self.predictor):
             normaliser.frozen = True
 

@@ -50,6 +50,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.body_modes import BodyModes
 from gausim.models.template.modal import ModalScene, force_of_strain
+from gausim.models.template.own_matrices import OwnMatrices
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import DENSITY, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
@@ -61,6 +62,8 @@ FASTEST = 4 * math.pi
 # Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
 # as a body's periods are wrong, strong damping fits best, and training is slow to reduce it again.
 GAIN, DAMPING_GAIN = 10.0, 0.5
+# Initial stiffness of the links e^{g_ij} over that of the body, by law.
+SPRINGS_OF_LAW = {"solid": 0.0, "springs": 1.0}
 # Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
 
@@ -71,7 +74,6 @@ class Links:
 
     neighbours: int = 12  # of a unit
     linear: float = 0.3  # initial stiffness and inertia of all links over the body's
-    springs: float = 0.15  # the same for the stiffness of links e^{g_ij}; its linear part is in K
     damping: float = 0.0  # resistance to the growth of length or strain over that to it [frames at 24 per second]
 
 
@@ -90,6 +92,7 @@ class Matrices:
 
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     mass: Float[Tensor, "M M"]  # M (M, M)
+    heavier: Float[Tensor, "M M"]  # M less that of the units and links
     inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
@@ -104,7 +107,7 @@ class Matrices:
 class MaterialTemplate(Template):
     """Template with the dynamics of a solid body, its material decoded from densities and attributes."""
 
-    has_energy, is_shared = True, True
+    has_energy = True
     # The network contributes to the motion, so the template's energy of the first frame underestimates its peaks.
     headroom = 2.0
 
@@ -118,7 +121,8 @@ class MaterialTemplate(Template):
         modes: int = 48,
         solid: SolidSettings | float = 0.12,
         links: Links | int = Links(),
-        finite_strain: bool = False,
+        law: str = "solid",
+        own_matrices: bool = False,
         hidden: int = 48,
         period: float = 8.0,
         damping: Damping | float = 0.02,
@@ -134,28 +138,34 @@ class MaterialTemplate(Template):
             modes: number of modes.
             solid: the solid body; a number stands for the spacing of its grid [diagonals].
             links: links between units; a number stands for so many neighbours.
-            finite_strain: of the body's cells; else the springs among the links are what is nonlinear.
+            law: what is nonlinear: ``solid``, the finite strain of the body's cells, or ``springs``, further links.
+            own_matrices: also train factors on the decoded matrices of each scene, so that its modes may mix.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1; a number stands for both [1 / frame, frames].
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
-            ConfigError: fewer than two attributes, or a damping that is negative.
+            ConfigError: fewer than two attributes, an unknown law, or a damping that is negative.
         """
         super().__init__()
+        if law not in SPRINGS_OF_LAW:
+            raise ConfigError(f"model.simulator.template.law is '{law}'; expected solid or springs.")
         if attributes < 2:
             raise ConfigError(
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
         self.conserve_volume = conserve_volume
         self.links = Links(links) if isinstance(links, int) else links
+        self.springs = SPRINGS_OF_LAW[law]
         self.solid = SolidSettings.of(solid)
-        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=finite_strain)
+        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=law == "solid")
         counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
             made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )
+        own = [OwnMatrices(self.body(i).modes.shape[-1]) for i in range(len(hierarchies))] if own_matrices else []
+        self.scenes = nn.ModuleList(own)
         damping = Damping(damping, damping) if isinstance(damping, int | float) else damping
         if damping.drag < 0 or damping.viscosity <= 0:
             raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
@@ -214,29 +224,25 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = self._damping(scene_id)
-        springs = self.links.springs * links[:, 2].exp()
+        springs = self.springs * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         cells = units[:, :2].exp()
         stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness) + body.stretch.mT @ stretch
         density, between = _saturated(log_density).exp(), self.links.linear * links[:, 1].exp()
-        heavy = density[:, None, None] * body.inertia
-        root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
-        inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
-        lost = (drag * frame * units[:, 2].exp()).div(2).tanh()
-        first, second = (lost.index_select(0, end) for end in body.springs.ends)
-        loss = (first + second)[:, None, None]  # twice a link's mean
-        dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
-        dragged = dragged + body.between.flatten(0, 1).mT @ (loss * tied).flatten(0, 1)
+        inertia, dragged = _inertia(body, density, between, (drag * frame * units[:, 2].exp()).div(2).tanh())
         rate = _trace(dragged) / _trace(inertia)
-        mass = inertia
+        stiffness = k * stiffness
+        even, mass, damping = inertia, inertia, dragged + (rate / 4 + viscosity / frame) * stiffness
+        if self.scenes:
+            stiffness, mass, damping = self.scenes[scene_id](stiffness, mass, damping)
+        inertia = mass
         if body.cells is not None:
-            slowed = ((k * stiffness).diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
-            inertia, dragged = mass + slowed, dragged + rate * slowed
-        damping = dragged + (rate / 4 + viscosity / frame) * k * stiffness
-        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.links.springs)
+            slowed = (stiffness.diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
+            inertia, damping = mass + slowed, damping + rate * slowed
+        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.springs)
         return Matrices(
-            k * stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1), tense,
-            self.links.damping / frame,
+            stiffness, mass, mass - even, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
+            tense, self.links.damping / frame,
         )  # fmt: skip
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
@@ -248,12 +254,12 @@ class MaterialTemplate(Template):
         body = self.body(scene_id)
         decoded, links = self.decode(body, units.attributes)
         parts = body.stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)  # of shear and volume (2, N)
-        factors = self.links.linear * links[:, 0].exp() + self.links.springs * links[:, 2].exp()
+        factors = self.links.linear * links[:, 0].exp() + self.springs * links[:, 2].exp()
         size = 0.5 * body.stretch.square().sum(-1)
         own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
         for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
-            homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.links.springs) * size)
+            homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.springs) * size)
         found = {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
@@ -272,6 +278,18 @@ class MaterialTemplate(Template):
         root = torch.linalg.inv(torch.linalg.cholesky(found.inertia))
         squared = torch.linalg.eigvalsh(root @ found.stiffness @ root.mT)[0]
         return 2 * math.pi / math.sqrt(float(squared)) / REFERENCE_FPS
+
+    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """Squared Frobenius norm of the mode mixing of a scene's own matrices."""
+        return cast(OwnMatrices, self.scenes[scene_id]).mixing_size() if self.scenes else None
+
+    def shared(self, prefix: str) -> tuple[str, ...]:
+        """Prefixes of the names of the decoders, of k and of the dampings."""
+        return tuple(prefix + name for name in ("stiffness", "damping", "unit_decoder.", "link_decoder."))
+
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """Prefix of the names of a scene's own matrices."""
+        return (f"{prefix}scenes.{scene_id}.",) if self.scenes else ()
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
@@ -292,6 +310,19 @@ class MaterialTemplate(Template):
     def vibrations(self, scene_id: int) -> int:
         """All modes but the modal derivatives of finite strain."""
         return self.body(scene_id).vibrations
+
+
+def _inertia(
+    body: BodyModes, density: Float[Tensor, " N"], between: Float[Tensor, " E"], lost: Float[Tensor, " N"]
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M M"]]:
+    """M and C from the densities of units and links and from t_i, the share of momentum that each unit loses."""
+    heavy, tied = density[:, None, None] * body.inertia, between[:, None, None] * body.between
+    root, links = body.inertia.flatten(0, 1), body.between.flatten(0, 1)
+    inertia = root.mT @ heavy.flatten(0, 1) + links.mT @ tied.flatten(0, 1)
+    first, second = (lost.index_select(0, end) for end in body.springs.ends)
+    loss = (first + second)[:, None, None]  # twice a link's mean
+    dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
+    return inertia, dragged + links.mT @ (loss * tied).flatten(0, 1)
 
 
 def _trace(matrix: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
@@ -330,6 +361,7 @@ class PreparedMaterial(ModalScene):
         tied = self.body.tie * self.matrices.between[:, None] * (second - first)
         own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
         own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
+        own = own + (acceleration.flatten(1) @ self.projection) @ self.matrices.heavier
         own = own + self.body.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 

@@ -125,11 +125,10 @@ class Template(nn.Module, ABC):
     Attributes:
         has_energy: whether the result of :meth:`prepare` has an energy, as that of :class:`PreparedScenes`.
         headroom: factor on the initial energy of a rollout, the energy guard's limit in its first frames.
-        is_shared: whether the parameters are common to all scenes, like the network's, or separate per scene.
         solid: the body whose static shape is the reference of a body in hands.
     """
 
-    has_energy, is_shared = False, False
+    has_energy = False
     headroom, solid = 1.0, SolidSettings()
 
     @abstractmethod
@@ -148,6 +147,10 @@ class Template(nn.Module, ABC):
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """Differentiable measure of the mode mixing relative to the initial body; None for templates without it."""
         return None
+
+    def shared(self, prefix: str) -> tuple[str, ...]:
+        """Prefixes of the names of the parameters that all scenes have in common, each after ``prefix``."""
+        return ()
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """Prefixes of the names of a scene's parameters and buffers in the state dict, each after ``prefix``."""
