@@ -91,16 +91,6 @@ def test_variations_stand_in_the_papers_order_whatever_their_directories_are_cal
     ]  # fmt: skip
 
 
-def test_old_configurations_are_read_by_present_names(tmp_path):
-    target = {"_target_": "gausim.models.simulator.GausSim", "radii": [0.1, 0.4]}
-    write_run(tmp_path / "old", config(**target, predicted_levels=[0], graph_radii=[0.1]))
-    write_run(tmp_path / "new", config(_target_="gausim.models.step.simulator.GausSim", **report_runs.NO_HIERARCHY))
-    write_run(tmp_path / "damaged", config(**target, predicted_levels=[5], graph_radii=[0.1]))
-    assert states(tmp_path)["damaged"] == "broken files"
-    found = [g.variation.split(" (")[0] for g in study_of(tmp_path).groups if g.family == "gausim"]
-    assert found.count("w/o hierarchy") == 2
-
-
 def test_rows_with_one_name_are_told_apart_by_what_differs(tmp_path):
     for rate in (0.001, 0.01):
         settings = config()

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from gausim.core import RunError
-from gausim.runs.checkpoint import RESUME_FORMAT, AtomicCheckpointIO
-from gausim.runs.directory import RunDirectory, changed_keys
+from gausim.runs.checkpoint import AtomicCheckpointIO
+from gausim.runs.comparison import changed_keys
+from gausim.runs.directory import RunDirectory
 
 CONFIG = {
     "seed": 0,
@@ -23,7 +24,7 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
         run.config()
     assert run.prepare(CONFIG) is None
     assert run.config() == CONFIG
-    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {"format": RESUME_FORMAT}}, run.checkpoint)
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {}}, run.checkpoint)
     assert run.prepare(CONFIG) == run.checkpoint
 
 

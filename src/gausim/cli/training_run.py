@@ -26,7 +26,6 @@ from gausim.doctor.examine import examine
 from gausim.doctor.page import findings_text
 from gausim.models.step.simulator import GausSim
 from gausim.results.looks import DEVELOPMENT, TEST_PART
-from gausim.runs.defaults import with_defaults
 from gausim.runs.directory import RunDirectory
 from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.time_budget import EpochJudge
@@ -78,8 +77,8 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:
-    """The whole configuration, defaults of constructors included."""
-    return cast("dict[str, Any]", with_defaults(OmegaConf.to_container(cfg, resolve=True)))
+    """The whole configuration, resolved."""
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
 
 
 def _evaluate(run: RunDirectory) -> None:
@@ -129,8 +128,7 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
 
 def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
     """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
-    protocol = cfg.get("protocol") or {}  # configurations of earlier versions have none
-    part, trials = protocol.get("part"), protocol.get("trials")
+    part, trials = cfg.protocol.part, cfg.protocol.trials
     if part not in (None, DEVELOPMENT, TEST_PART):
         raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
     if not cfg.evaluate or not datamodule.has_videos:

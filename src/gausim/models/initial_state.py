@@ -166,7 +166,7 @@ class ModalInitialStates(InitialStates):
         self.velocity = nn.ParameterList(torch.zeros(sizes[i]) for i in self.scene_of_sequence)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also of other machines, whose eigenvectors may have other signs, and of checkpoints without signatures."""
+        """Also of other machines, whose eigenvectors may have other signs."""
         for scene_id in range(len(self._basis)):
             name = f"{prefix}signature_{scene_id}"
             own = self.get_buffer(f"signature_{scene_id}")

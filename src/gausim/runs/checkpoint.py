@@ -16,13 +16,10 @@ from torch import Tensor, nn
 from gausim.core import GaussianScene, RunError
 from gausim.io.files import write_durably
 from gausim.runs.names import LAST_CHECKPOINT
-from gausim.runs.renamed import with_present_weights
 
 PREVIOUS_CHECKPOINT = "last.previous.ckpt"
 BEFORE_THE_END = "before_the_end.ckpt"  # of a run stopped by its time limit: it can be continued from there
 DIGEST = "digest"
-# Increase it when a bit-exact resume needs additional content in checkpoints.
-RESUME_FORMAT = 2
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -61,8 +58,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Reads a checkpoint that :class:`AtomicCheckpointIO` wrote, to the CPU.
 
-    Files of earlier versions have no digest; their weights are read unchecked.
-
     Raises:
         RunError: the file is missing, damaged or not a checkpoint of gausim.
     """
@@ -77,10 +72,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise _damaged(path, (str(error) or type(error).__name__).splitlines()[0]) from error
     if not isinstance(loaded, dict) or "state_dict" not in loaded or "gausim" not in loaded:
         raise RunError(f"{path}: expected a checkpoint of gausim (entries 'state_dict' and 'gausim').")
-    if DIGEST in loaded:
-        expected, found = loaded[DIGEST], digest({k: v for k, v in loaded.items() if k != DIGEST})
-        if found != expected:
-            raise _damaged(path, f"its content has digest {found[:12]}, expected {str(expected)[:12]}")
+    expected, found = str(loaded.get(DIGEST)), digest({k: v for k, v in loaded.items() if k != DIGEST})
+    if found != expected:
+        raise _damaged(path, f"its content has digest {found[:12]}, expected {expected[:12]}")
     return loaded
 
 
@@ -89,20 +83,6 @@ def _damaged(path: Path, reason: str) -> RunError:
         f"{path}: cannot be read as a checkpoint ({reason}). It is damaged, or not gausim's. The command that trained "
         f"it falls back to {PREVIOUS_CHECKPOINT} beside it, where there is one."
     )
-
-
-def check_resumable(path: Path) -> None:
-    """Reads a checkpoint to check that a run can continue from it.
-
-    Raises:
-        RunError: the checkpoint is damaged, or its version lacks content that an exact resume needs.
-    """
-    checkpoint = read_checkpoint(path)
-    if DIGEST not in checkpoint or checkpoint["gausim"].get("format") != RESUME_FORMAT:
-        raise RunError(
-            f"{path}: written by another version of gausim, which did not save what a resumed run needs here. Finish "
-            "it with that version, or train anew (overwrite=true). It can still be evaluated."
-        )
 
 
 def _check_written(path: Path, expected: str) -> None:
@@ -204,7 +184,7 @@ class WeightAverage:
 
 def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
     """The weights of a checkpoint by name; averaged weights take precedence."""
-    return with_present_weights({**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]})
+    return {**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]}
 
 
 def load_weights(module: nn.Module, checkpoint: dict[str, Any]) -> None:

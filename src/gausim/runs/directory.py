@@ -19,24 +19,16 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import GausSimError, RunError
 from gausim.io.files import read_yaml, remove_leftovers, write_durably
-from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
-from gausim.runs.defaults import flatten, with_defaults
+from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, read_checkpoint
+from gausim.runs.comparison import changed_keys
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
 
 from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
-from gausim.runs.renamed import with_present_names
 
 LOCK, EVENTS = ".lock", "events.jsonl"
 GRANTED = "granted more"  # event: the run was granted further epochs and minutes
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
-# Keys that may differ when a run is resumed: paths, display and hardware, which do not change the learned weights.
-FREE_KEYS = (
-    "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "protocol", "task_name", "doctor", "evaluate",
-    "trainer.threads", "render.threads",
-    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
-    "trainer.log_every_n_steps", "trainer.progress", "overwrite",
-)  # fmt: skip
 # Files that `overwrite` removes; gausim made no others in the directory.
 OWN_FILES = (
     CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, BEFORE_THE_END, DAMAGED_CHECKPOINT, EPOCHS,
@@ -109,16 +101,9 @@ class RunDirectory:
         if not path.is_file():
             raise RunError(f"{self.path}: no run here ({CONFIG} is missing). Train first (`gausim train name=NAME`).")
         try:
-            loaded = read_yaml(path)
+            return dict(read_yaml(path))
         except ValueError as error:
             raise RunError(str(error)) from error
-        try:
-            return dict(with_present_names(loaded))
-        except (IndexError, TypeError, ValueError) as error:
-            raise RunError(
-                f"{path}: model.simulator: expected the settings of this version or the one before, got some that "
-                f"cannot be read ({error}). Restore the file, or read the run with the version that made it."
-            ) from error
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -177,7 +162,7 @@ class RunDirectory:
         return bool(dict(self.facts().get("learning") or {}).get("cut_short"))
 
     def _go_on(self) -> None:
-        check_resumable(self.path / BEFORE_THE_END)
+        read_checkpoint(self.path / BEFORE_THE_END)
         self.record(GRANTED)
         (self.path / PREVIOUS_CHECKPOINT).unlink(missing_ok=True)
         os.replace(self.path / BEFORE_THE_END, self.checkpoint)
@@ -227,7 +212,7 @@ class RunDirectory:
         problems: list[str] = []
         for path in filter(Path.is_file, (self.checkpoint, self.path / PREVIOUS_CHECKPOINT)):
             try:
-                check_resumable(path)
+                read_checkpoint(path)
             except RunError as error:
                 problems.append(str(error))
                 continue
@@ -279,19 +264,3 @@ def _who() -> dict[str, Any]:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted keys whose values differ between two configurations, without those that a resumed run may change."""
-    return [key for key in differing_keys(old, new) if not is_free(key)]
-
-
-def is_free(key: str) -> bool:
-    """Whether a dotted key may change when a run is resumed."""
-    return any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
-
-
-def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted keys whose values differ between two configurations; missing keys have their defaults."""
-    first, second = dict(flatten(with_defaults(old))), dict(flatten(with_defaults(new)))
-    return [key for key in sorted({*first, *second}) if first.get(key) != second.get(key)]

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from gausim.data.dataset import SequenceSample
 from gausim.data.sampler import hash_seed
-from gausim.runs.checkpoint import RESUME_FORMAT, check_scenes, fingerprints
+from gausim.runs.checkpoint import check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
-from gausim.runs.renamed import with_present_weights
 from gausim.training.method import Moment
 from gausim.training.statistics import Baselines
 from gausim.training.step import OptimiserStep
@@ -142,7 +141,7 @@ class GausSimModule(OptimiserStep, LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds the scenes' fingerprints, the averaged weights and the epoch's sums."""
-        own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
+        own: dict[str, Any] = {"scenes": fingerprints(self.simulator.scenes)}
         own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self.barren}
         own["baselines"] = self.baselines.state_dict()
@@ -157,14 +156,13 @@ class GausSimModule(OptimiserStep, LightningModule):
             RunError: the checkpoint is of other scenes.
         """
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
-        checkpoint["state_dict"] = with_present_weights(checkpoint["state_dict"])
         self.take_notes(checkpoint)
         own = checkpoint["gausim"]
-        self.average.load_state_dict({**own["average"], "values": with_present_weights(own["average"]["values"])})
+        self.average.load_state_dict(own["average"])
         epoch = own["epoch"]
         self._sums, self.summary = epoch["sums"], epoch["summary"]
         self._warned, self.barren = epoch["warned"], epoch["barren"]
-        self.baselines.load_state_dict(own.get("baselines") or own["yardsticks"])
+        self.baselines.load_state_dict(own["baselines"])
         if isinstance(self.supervision, TrackSupervision):
             self.supervision.load_state_dict(own.get("tracks", {}))
         self.method.load_state_dict(own)
@@ -172,5 +170,4 @@ class GausSimModule(OptimiserStep, LightningModule):
     def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
         """Restores from a checkpoint what :attr:`footnotes` needs."""
         self.method.take_notes(checkpoint["gausim"])
-        if "cost" in checkpoint:  # not in those of earlier versions
-            self.cost.load_state_dict(checkpoint["cost"])
+        self.cost.load_state_dict(checkpoint["cost"])

@@ -12,7 +12,8 @@ from gausim.core import ConfigError, RunError
 from gausim.models.step.predictor import with_floor_columns
 from gausim.models.step.simulator import GausSim
 from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, scene_text
-from gausim.runs.directory import RunDirectory, differing_keys
+from gausim.runs.comparison import differing_keys
+from gausim.runs.directory import RunDirectory
 
 # Prefix of the simulator's weights in a checkpoint of the training module.
 _PREFIX = "model."

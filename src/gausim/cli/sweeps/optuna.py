@@ -25,7 +25,8 @@ from gausim.compose.config import check_targets, instantiate
 from gausim.compose.places import spelled
 from gausim.core.errors import ConfigError
 from gausim.io.files import write_durably
-from gausim.runs.directory import RunDirectory, is_free
+from gausim.runs.comparison import is_free
+from gausim.runs.directory import RunDirectory
 from gausim.runs.files import sole_writer
 from gausim.training.callbacks.time_budget import EpochJudge
 

@@ -44,7 +44,7 @@ class FeatureOptions:
         attributes: material attributes per unit.
         gravity: acceleration [scene units / s^2].
         normaliser_floor: smallest standard deviation of a normalised input.
-        floor: nearness of the units to the floor, in models of which a scene has one. False in runs from before it.
+        floor: nearness of the units to the floor, in models of which a scene has one.
 
     Raises:
         ConfigError: an unknown angle, or neither velocities nor rest_inputs.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -80,11 +80,6 @@ class ElasticScene(nn.Module):
         self.beyond = nn.Parameter(torch.zeros(len(rest), 3))
         self.springs = unit_springs(rest, phi, neighbours)
         self.gain = nn.Parameter(torch.tensor(float(geometric)))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also of checkpoints that know no load."""
-        state_dict.setdefault(f"{prefix}beyond", torch.zeros_like(self.beyond))
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def roots(self) -> tuple[Tensor, Tensor]:
         """S (M,) and L (M, M) of K = S L L^T S."""

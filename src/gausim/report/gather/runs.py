@@ -19,9 +19,8 @@ import yaml
 from gausim.core import RunError
 from gausim.io.files import natural, read_yaml
 from gausim.results.summary import dig, load_summary
-from gausim.runs.defaults import flatten
+from gausim.runs.comparison import flatten
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
-from gausim.runs.renamed import with_present_names
 
 # Files that identify a run whose configuration is unreadable.
 _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
@@ -182,10 +181,6 @@ def _read_run(folder: Path, name: str) -> RunRecord:
         config = read_yaml(path)
     except ValueError as error:
         return made(BROKEN, str(error))
-    try:
-        config = with_present_names(config)
-    except (IndexError, TypeError, ValueError) as error:
-        return made(BROKEN, f"{path}: its levels cannot be read ({error}).")
     metrics = folder / EVALUATION
     if not metrics.is_file():
         return made(*_state(folder, is_run), config)

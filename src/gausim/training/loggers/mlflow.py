@@ -15,7 +15,7 @@ from lightning.pytorch.loggers import MLFlowLogger
 
 from gausim.core import ConfigError
 from gausim.io.files import write_durably
-from gausim.runs.defaults import flatten
+from gausim.runs.comparison import flatten
 from gausim.runs.names import MLFLOW_ID
 from gausim.runs.randomness import undisturbed
 from gausim.training.loggers.files import error_plot
