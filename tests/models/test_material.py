@@ -426,10 +426,11 @@ def test_every_model_of_it_can_be_made_stiffer() -> None:
     assert isinstance(live, Adjustable) and not isinstance(scene_dynamics(make_model(model.scenes[0])), Adjustable)
     period = model.template.slowest_period(0, *_material_of(model))
     live.adjust(4.0, 1.0)
-    stiffer = model.template.slowest_period(0, *_material_of(model))
+    stiffer = live.model.template.slowest_period(0, *_material_of(live.model))
     assert stiffer == pytest.approx(period / 2, rel=0.1)  # the decoders read it, too
+    assert model.template.slowest_period(0, *_material_of(model)) == period  # predictions of the run stay
     live.adjust(1.0, 1.0)  # over the beginning, not over the last
-    assert model.template.slowest_period(0, *_material_of(model)) == pytest.approx(period, rel=1e-6)
+    assert live.model.template.slowest_period(0, *_material_of(live.model)) == pytest.approx(period, rel=1e-6)
     assert torch.isfinite(live.rollout(SimState(rest, 0.99 * rest), 3).positions).all()
 
 
@@ -441,7 +442,7 @@ def test_every_model_of_it_can_be_damped(given: Damping) -> None:
     live = scene_dynamics(model)
 
     def damping() -> torch.Tensor:
-        return model.template.matrices(0, *_material_of(model), 1 / 24).damping.trace()
+        return live.model.template.matrices(0, *_material_of(live.model), 1 / 24).damping.trace()
 
     before = damping()
     live.adjust(1.0, 4.0)

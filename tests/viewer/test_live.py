@@ -185,3 +185,20 @@ def test_a_companion_feels_the_same(make_interaction: Callable[..., Interaction]
     assert beside is not None and torch.equal(beside.frame.positions, follower.frame.positions)
     one.reset()
     assert torch.equal(follower.frame.positions, follower.scene.means)
+
+
+def test_a_companion_replays_with_the_gravity_and_the_gusts_of_the_session(make_interaction) -> None:
+    recorded = Live(make_interaction(gravity=2.0), lambda _: None)
+    recorded.interaction.seed = 3
+    recorded.begin()
+    recorded.act(Force(Whole(), (1.0, 0, 0), 1.0))
+    recorded.act(Wind((0.0, 1.0, 0.0), 1.0, gusts=1.0))
+    for _ in range(4):
+        recorded.advance()
+    one = Live(make_interaction(), lambda _: None, companion=Companion("the same again", make_interaction()))
+    one.replay(recorded.interaction.session())
+    for _ in range(4):
+        one.advance()
+    beside = one.shown().beside
+    assert torch.equal(one.shown().frame.positions, recorded.interaction.frame.positions)
+    assert beside is not None and torch.equal(beside.frame.positions, recorded.interaction.frame.positions)

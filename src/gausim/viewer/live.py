@@ -222,13 +222,17 @@ class Live(threading.Thread):
         self._begin(Interaction.restart)
 
     def _begin(self, how: Callable[[Interaction], None]) -> None:
-        how(self.interaction)
+        for one in self._both():
+            how(one)
         if self.companion is not None:
-            how(self.companion.interaction)
             self.companion.message = ""
         self._history.clear()
         self._place = None
         self._remember()
+
+    def _both(self) -> list[Interaction]:
+        """The simulation, and that of the companion if there is one."""
+        return [self.interaction] if self.companion is None else [self.interaction, self.companion.interaction]
 
     def replay(self, session: ForceSession) -> None:
         """Replays a session from the initial state.
@@ -239,7 +243,8 @@ class Live(threading.Thread):
         wrong = session.differences(self.interaction.made_with, self.interaction.fps)
         if any(not allowed for _, allowed in wrong):
             raise ConfigError("session: " + "; ".join(text for text, _ in wrong) + ".")
-        self.interaction.gravity, self.interaction.seed = session.gravity, session.seed
+        for one in self._both():
+            one.gravity, one.seed = session.gravity, session.seed
         self.begin()
         self._script, self._pending = session, deque(session.entries)
         self.playing = True

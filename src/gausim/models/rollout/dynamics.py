@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import cast
 
@@ -54,10 +55,15 @@ class SceneDynamics:
 
 
 class MaterialDynamics(SceneDynamics):
-    """Rollouts of a scene whose attributes 0 and 1 are the logarithms of its stiffness and damping."""
+    """Rollouts of a scene whose attributes 0 and 1 are the logarithms of its stiffness and damping.
+
+    It has parameters and a template of its own, so that :meth:`adjust` leaves the given model as it is.
+    """
 
     def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
         """Takes the arguments of :class:`SceneDynamics`."""
+        shared = {id(part): part for part in (*model.scenes, *model.hierarchies)}  # large, and never changed
+        model = copy.deepcopy(model, shared)
         super().__init__(model, scene_id, energy_ceiling=energy_ceiling)
         self._given = model.attributes[scene_id].detach().clone()
         self._ceiling = energy_ceiling
