@@ -6,17 +6,17 @@ Of a file only triangles and polygons are read.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyElement
 
 from data_prep.common.spread import farthest
 from gausim.core import DataError
-from gausim.io.ply_elements import Element, positions, read_elements
+from gausim.io.ply import list_properties, positions, read_ply
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -105,21 +105,22 @@ def _fan(corners: Sequence[int]) -> list[tuple[int, int, int]]:
 
 def _read_ply(path: Path) -> tuple[Array, Indices]:
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    for element, columns in read_elements(path):
+    for element in read_ply(path):
         if element.name == "vertex":
-            vertices = positions(path, element, columns)
+            vertices = positions(path, element)
         elif element.name == "face":
-            triangles = _faces(path, element, columns)
+            triangles = _faces(path, element)
     return vertices, triangles
 
 
-def _faces(path: Path, element: Element, columns: Mapping[str, Any]) -> Indices:
-    chosen = next((name for name in FACE_FIELDS if name in element.lists), None)
+def _faces(path: Path, element: PlyElement) -> Indices:
+    lists = list_properties(element)
+    chosen = next((name for name in FACE_FIELDS if name in lists), None)
     if chosen is None:
-        raise DataError(f"{path}: faces have lists {element.lists}, expected '{FACE_FIELDS[0]}'.")
-    column = columns[chosen]
-    if isinstance(column, np.ndarray) and column.ndim == 2 and column.shape[1] == 3:
-        return _whole(path, column)
+        raise DataError(f"{path}: faces have lists {lists}, expected '{FACE_FIELDS[0]}'.")
+    column = element[chosen]
+    if all(len(corners) == 3 for corners in column):
+        return _whole(path, np.array(list(column)).reshape(-1, 3))
     triangles: list[tuple[int, int, int]] = []
     for i, corners in enumerate(column):
         try:

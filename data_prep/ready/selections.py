@@ -14,8 +14,7 @@ from torch import Tensor
 
 from gausim.core import DataError, GaussianScene, SceneError
 from gausim.io.npz import read_array
-from gausim.io.ply import MASK_NAMES
-from gausim.io.ply_elements import positions, read_elements
+from gausim.io.ply import MASK_NAMES, positions, read_ply
 from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selection, parse_half_space
 
 # Syntax of a term, by its first word.
@@ -88,7 +87,7 @@ def read_points(path: Path) -> np.ndarray:
         DataError: the file is missing, malformed, empty or too large, or a number is not finite.
     """
     if path.suffix.lower() == ".ply":
-        found = (positions(path, *part) for part in read_elements(path) if part[0].name == "vertex")
+        found = (positions(path, element) for element in read_ply(path) if element.name == "vertex")
         points = next(found, np.zeros(0))
     elif not path.is_file():
         raise DataError(f"{path}: no such file. Expected points as npz, ply or txt.")

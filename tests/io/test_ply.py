@@ -87,10 +87,9 @@ def test_damaged_text_is_refused(tmp_path: Path) -> None:
     plyfile.PlyData(plyfile.PlyData.read(tmp_path / "good.ply").elements, text=True).write(tmp_path / "text.ply")
     header, _, body = (tmp_path / "text.ply").read_text().partition("end_header\n")
     rows = body.splitlines()
-    for changed, needle in ((rows[:-1], "truncated"), (["1 2"] * 7, "truncated"), ([*rows, "1"], "7 of 'vertex'"),
-                           (["x", *rows[1:]], "expected numbers")):  # fmt: skip
+    for changed in (rows[:-1], ["1 2"] * 7, ["x", *rows[1:]], [*rows[:-1], "x y"]):
         (tmp_path / "bad.ply").write_text(header + "end_header\n" + "\n".join(changed) + "\n")
-        refuse(tmp_path / "bad.ply", needle)
+        refuse(tmp_path / "bad.ply", "cannot be read")
 
 
 def refuse(path: Path, *needles: str) -> None:
@@ -100,16 +99,13 @@ def refuse(path: Path, *needles: str) -> None:
         assert needle in str(caught.value)
 
 
-def test_counts_that_do_not_fit_the_data_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [lambda d: d[:-1], lambda d: d[:60], lambda d: d + b"\0" * 400,
+                                    lambda d: d.replace(b"vertex 7", b"vertex 999999999999")])  # fmt: skip
+def test_counts_that_do_not_fit_the_data_are_refused(tmp_path: Path, change) -> None:
     path = tmp_path / "scene.ply"
     save_scene(random_scene(), path)
-    good = path.read_bytes()
-    for bad, *needles in (
-        (good[:-1], "truncated", "7 of 'vertex'"), (good[:60], "end_header"),
-        (good + b"\0" * 400, "not what its header says"),
-    ):  # fmt: skip
-        path.write_bytes(bad)
-        refuse(path, *needles)
+    path.write_bytes(change(path.read_bytes()))
+    refuse(path)
 
 
 @pytest.mark.parametrize(
@@ -137,12 +133,14 @@ def test_wrong_values_and_properties_are_refused(tmp_path: Path, changed: dict, 
 @pytest.mark.parametrize(
     ("content", "needle"),
     [
-        (b"solid cube\n", "first line 'ply'"),
-        (b"ply\nelement vertex 1\nproperty float x\nend_header\n0000", "'format'"),
+        (b"solid cube\n", "'ply'"),
+        (b"ply\nelement vertex 1\nproperty float x\nend_header\n0000", "format"),
         (b"ply\nformat binary_little_endian 1.0\nelement face 1\nproperty float x\nend_header\n0000", "'vertex'"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "empty"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n0", "'x'"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex one\nproperty float x\nend_header\n0", "vertex one"),
+        (b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n0\n", "odd.ply"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex -5\nproperty float x\nend_header\n0", "odd.ply"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex one\nproperty float x\nend_header\n0", "integer count"),
     ],
 )
 def test_malformed_headers_are_refused(tmp_path: Path, content: bytes, needle: str) -> None:

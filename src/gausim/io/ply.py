@@ -6,6 +6,7 @@ needs, are in ``<stem>.masks.npz`` next to it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,13 +16,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.lib.recfunctions import structured_to_unstructured
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from gausim.core.errors import DataError, SceneError
 from gausim.core.scene import GaussianScene
 from gausim.io.files import replacing
 from gausim.io.npz import read_npz
-from gausim.io.ply_elements import read_elements
 
 MASK_SUFFIX = ".masks.npz"
 MASK_NAMES = ("simulated", "pinned", "foreground")
@@ -36,6 +37,43 @@ def masks_path(path: Path | str) -> Path:
     """The side file of a scene: ``scene.ply`` -> ``scene.masks.npz``."""
     path = Path(path)
     return path.with_name(path.stem + MASK_SUFFIX)
+
+
+def read_ply(path: Path) -> PlyData:
+    """Reads a PLY file in text or binary of either byte order.
+
+    Raises:
+        DataError: the file is missing, no PLY file, cut off, or (if binary) longer than its header says.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file. Expected a scene, points or a mesh in PLY format.")
+    try:
+        with path.open("rb") as file:
+            ply = PlyData.read(file)
+            left = 0 if ply.text else os.path.getsize(path) - file.tell()
+    except (PlyParseError, ValueError, TypeError, OverflowError, MemoryError, OSError) as error:
+        raise DataError(f"{path}: cannot be read as PLY ({error!s:.200}). Copy or export it again.") from error
+    # Some writers end with a line break; more means that a count in the header is wrong.
+    if left > 2:
+        raise DataError(f"{path}: has {left} bytes after what its header declares. Export it again.")
+    return ply
+
+
+def list_properties(element: PlyElement) -> list[str]:
+    """Names of an element's properties that are lists."""
+    return [p.name for p in element.properties if isinstance(p, PlyListProperty)]
+
+
+def positions(path: Path, element: PlyElement) -> Float[np.ndarray, "N 3"]:
+    """The properties x, y and z of an element as float64.
+
+    Raises:
+        DataError: one is missing or a list.
+    """
+    numbers = sorted({p.name for p in element.properties} - set(list_properties(element)))
+    if not {"x", "y", "z"} <= set(numbers):
+        raise DataError(f"{path}: '{element.name}' has properties {numbers}, expected x, y and z.")
+    return np.stack([np.asarray(element[axis], np.float64) for axis in "xyz"], 1)
 
 
 def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str | None = None) -> GaussianScene:
@@ -168,13 +206,14 @@ def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
 def _read_vertices(path: Path) -> np.ndarray:
     """The table of the vertices, which have to be the first element."""
     try:
-        element, table = next(read_elements(path), (None, None))
+        elements = read_ply(path).elements
     except DataError as error:
         raise SceneError(str(error)) from error
-    if element is None or element.name != "vertex":
-        found = "none" if element is None else f"'{element.name}'"
+    if not elements or elements[0].name != "vertex":
+        found = f"'{elements[0].name}'" if elements else "none"
         raise SceneError(f"{path}: first element must be 'vertex', got {found}. Expected a 3DGS scene.")
-    if element.count == 0 or element.lists:
-        what = f"property '{element.lists[0]}' is a list" if element.lists else "is empty"
+    lists = list_properties(elements[0])
+    if elements[0].count == 0 or lists:
+        what = f"property '{lists[0]}' is a list" if lists else "is empty"
         raise SceneError(f"{path}: element 'vertex': {what}. Export the file as a 3DGS scene.")
-    return np.asarray(table)
+    return np.asarray(elements[0].data)
