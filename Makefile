@@ -20,7 +20,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help install test test-slow test-types fuzz test-notebooks docs results lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-types test-notebooks docs results lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -46,9 +46,6 @@ test-types: install ## Run the default tests with every annotated type and shape
 # One at a time: each is written for two cores, and compiling in two processes at once would compile twice.
 test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	$(ONE_THREAD) $(BIN)/python -m pytest -p nbmake --nbmake --nbmake-timeout=600 notebooks
-
-fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
-	PYTHONPATH=.:tests $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
 
 docs: install results ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
 	$(BIN)/python -c "import material" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"

@@ -19,7 +19,7 @@ from gausim.core import DataError
 if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
 
-REVISION = 1
+REVISION = 2
 # Files of an object besides its sequences; copied unchanged.
 PARTS = ("dataset.json", "scene.ply", "scene.masks.npz", "scene.json", "rest_points.npz", "rest_mesh.npz", "static")
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from helpers.blob import make_object, ring_of_cameras
@@ -19,7 +20,7 @@ from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.data.records import SequenceRecord
-from gausim.io.packed import HEADER, PIXELS, Crop, header
+from gausim.io.packed import view_path, write_header
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +79,8 @@ def test_memory_does_not_grow_with_the_set(tmp_path: Path) -> None:
     sequences, frames, views, side = 10, 16, ("cam_0", "cam_1", "cam_2"), 160
     (root / "sequences" / "seq_000").rename(tmp_path / "small")
     cameras = ring_of_cameras(views, width=side, height=side)
-    block = frames * 4 * side * side
     for number in range(sequences):
-        _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side, block)
+        _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side)
     data = stream(root, batch_size=1, curriculum=Curriculum(t_start=15))
     batch = frames * 2 * 4 * side * side  # two training views
     tracemalloc.start()
@@ -96,12 +96,11 @@ def test_memory_does_not_grow_with_the_set(tmp_path: Path) -> None:
     assert max(peaks) < 2.5 * batch < sequences * batch / 2
 
 
-def _sparse_sequence(folder: Path, cameras: Cameras, frames: int, side: int, block: int) -> None:
+def _sparse_sequence(folder: Path, cameras: Cameras, frames: int, side: int) -> None:
     folder.mkdir(parents=True)
-    crops = [Crop(0, 0, side, side, view * block) for view in range(3)]
-    with (folder / PIXELS).open("wb") as file:
-        file.truncate(3 * block)
-    (folder / HEADER).write_bytes(header(cameras, crops, count=frames, fps=24.0, size=3 * block, sha256="0" * 64))
+    for view in range(3):
+        np.lib.format.open_memmap(view_path(folder, view), mode="w+", dtype=np.uint8, shape=(frames, side, side, 4))
+    write_header(folder, cameras, [(0, 0)] * 3, 24.0)
 
 
 def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:

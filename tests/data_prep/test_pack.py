@@ -19,7 +19,7 @@ from gausim.data.dataset import SampleKey, SequenceIndex
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
-from gausim.io.packed import HEADER, PIXELS, bounding_crop, read_packed
+from gausim.io.packed import HEADER, bounding_box, read_packed
 
 
 @pytest.fixture(scope="module")
@@ -51,25 +51,24 @@ def test_a_packed_object_gives_the_same_samples(toy: Path, packed: Path) -> None
 def test_only_the_foreground_is_stored_and_nothing_else_is_lost(toy: Path, packed: Path) -> None:
     share = json.loads((packed / "stage.json").read_text())["results"]["share"]
     assert 0.1 < share < 0.9  # the block fills most of these small images
-    header = read_packed(packed / "sequences" / "seq_000")
+    folder = packed / "sequences" / "seq_000"
     record = ObjectData(toy).sequences[0]
-    for column, crop in enumerate(header.crops):
+    for column, (top, left) in enumerate(read_packed(folder).corners):
         touched = (record.frames(range(9), [record.views[column]])[:, 0, ..., 3] > 0).any(0)
         rows, columns = touched.any(1).nonzero()[:, 0], touched.any(0).nonzero()[:, 0]
-        assert (crop.top, crop.left) == (int(rows[0]), int(columns[0]))
-        assert (crop.top + crop.height, crop.left + crop.width) == (int(rows[-1]) + 1, int(columns[-1]) + 1)
+        assert (top, left) == (int(rows[0]), int(columns[0]))
+        stored = np.load(folder / f"view_{column}.npy")
+        assert stored.shape[1:3] == (int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left)
     names = {str(p.relative_to(toy)) for p in toy.rglob("*") if p.is_file() and "cam_" not in str(p)}
     kept = {str(p.relative_to(packed)) for p in packed.rglob("*") if p.is_file()}
     assert {n for n in names if "transforms.json" not in n or n.startswith("static")} <= kept
 
 
-def test_a_view_without_foreground_takes_no_bytes() -> None:
-    crop = bounding_crop(np.zeros((3, 5, 7), np.uint8), 2, 11)
-    assert crop.frame_bytes == 0 and crop.offset == 11
+def test_the_box_holds_the_foreground_and_its_margin() -> None:
     alpha = np.zeros((3, 5, 7), np.uint8)
+    assert alpha[0][bounding_box(alpha, 2)].size == 0
     alpha[1, 0, 6], alpha[2, 3, 4] = 1, 255
-    crop = bounding_crop(alpha, 1, 0)
-    assert (crop.left, crop.top, crop.width, crop.height) == (3, 0, 4, 5)
+    assert bounding_box(alpha, 1) == (slice(0, 5), slice(3, 7))
 
 
 # ---------------------------------------------------------------------------------------------------- faults
@@ -86,12 +85,16 @@ def _header(change: Callable[[dict], object]) -> Callable[[Path], object]:
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
-    "pixels cut": (lambda s: _cut(s / "sequences/seq_001" / PIXELS), "seq_001", "expected .* bytes"),
+    "pixels cut": (lambda s: _cut(s / "sequences/seq_001/view_1.npy"), "seq_001", "view_1.npy: cannot be read"),
     "schema": (_header(lambda d: d.update(schema=9)), "seq_000", "schema"),
     "nan": (_header(lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
-    "crop": (_header(lambda d: d["views"][0].update(crop=[30, 0, 9, 9])), "seq_000", "leaves the image"),
-    "offset": (_header(lambda d: d["views"][2].update(offset=10**9)), "seq_000", "offset"),
-    "frames": (_header(lambda d: d.update(frames=10**9)), "seq_000", "frames"),
+    "corner": (_header(lambda d: d["views"][0].update(left=30)), "seq_000", "expected 9 frames inside"),
+    "frames": (
+        lambda s: np.save(s / "sequences/seq_000/view_2.npy", np.zeros((8, 1, 1, 4), np.uint8)),
+        "seq_000",
+        "got 8",
+    ),
+    "objects": (lambda s: np.save(s / "sequences/seq_000/view_0.npy", np.array([None])), "seq_000", "cannot be read"),
     "focal": (_header(lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)), "seq_000", "focal"),
     "fps": (_header(lambda d: d.update(fps=25)), "seq_000", "fps"),
     "view": (_header(lambda d: d["views"][0].update(name="cam_9")), "seq_000", "cam_9"),
@@ -115,12 +118,12 @@ def test_every_fault_is_named(store: Path, name: str) -> None:
 
 
 def test_all_faults_at_once(store: Path) -> None:
-    pixels = store / "sequences" / "seq_000" / PIXELS
+    pixels = store / "sequences" / "seq_000" / "view_0.npy"
     data = pixels.read_bytes()
     pixels.write_bytes(data[:-1] + bytes([data[-1] ^ 255]))
     (store / "sequences" / "seq_001" / HEADER).unlink()
     (store / "scene.masks.npz").write_bytes(b"nothing")
     places = {fault.where for fault in verify(store)}
-    assert {"sequences/seq_000/frames.bin", "sequences/seq_001", "scene.ply"} <= places
+    assert {"sequences/seq_000/view_0.npy", "sequences/seq_001", "scene.ply"} <= places
     quick = {fault.where for fault in verify(store, quick=True)}
-    assert "sequences/seq_001" in quick and "sequences/seq_000/frames.bin" not in quick
+    assert "sequences/seq_001" in quick and "sequences/seq_000/view_0.npy" not in quick

@@ -17,7 +17,7 @@ from gausim.benchmark.harness import Options, Row, medians, peak_resident, proce
 from gausim.core import Cameras
 from gausim.data.frames import ImageSource, PackedSource
 from gausim.data.images import write_rgba
-from gausim.io.packed import HEADER, PIXELS, Crop, header, read_packed, write_packed
+from gausim.io.packed import read_packed, view_path, write_header, write_packed
 from gausim.io.transforms import write_transforms
 
 FPS, FRAMES, VIEWS, CROPPED = 24.0, 16, 4, 0.2
@@ -70,16 +70,14 @@ def _large(folder: Path, options: Options) -> list[Row]:
     sequences, frames, views, width, height = (3, 20, 2, 96, 54) if options.quick else PAPER
     cameras = _cameras(views, width, height)
     side = CROPPED**0.5
-    crop = Crop(0, 0, int(side * width), int(side * height), 0)
-    crops = [Crop(0, 0, crop.width, crop.height, view * frames * crop.frame_bytes) for view in range(views)]
-    total = views * frames * crop.frame_bytes
+    shape = (frames, int(side * height), int(side * width), 4)
+    total = views * int(np.prod(shape))
     for number in range(sequences):
         place = folder / f"seq_{number:03d}"
         place.mkdir(parents=True)
-        with (place / PIXELS).open("wb") as file:
-            file.truncate(total)
-        text = header(cameras, crops, count=frames, fps=FPS, size=total, sha256="0" * 64)
-        (place / HEADER).write_bytes(text)
+        for view in range(views):
+            np.lib.format.open_memmap(view_path(place, view), mode="w+", dtype=np.uint8, shape=shape)
+        write_header(place, cameras, [(0, 0)] * views, FPS)
     sources: list[PackedSource] = []
     opened = seconds_of(
         lambda: sources.extend(PackedSource(place, cameras.names, FPS) for place in sorted(folder.iterdir())),

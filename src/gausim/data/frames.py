@@ -66,7 +66,7 @@ class PackedSource:
         return self._packed.read(frames, [self._columns[column] for column in columns])
 
     def absent(self) -> list[Path]:
-        """An empty list: the header was checked against the size of the pixel file."""
+        """An empty list: the header was checked against the files of the pixels."""
         return []
 
 

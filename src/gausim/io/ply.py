@@ -164,7 +164,10 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
     scale = stored.get("volume_scale", np.zeros(0))
     if scale.shape != () or not np.isfinite(scale) or scale <= 0:
         raise SceneError(f"{path}: field 'volume_scale': expected one positive number, got {scale!r}.")
-    return replace(scene, volume_scale=float(scale), **values).validated()
+    try:
+        return replace(scene, volume_scale=float(scale), **values).validated()
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:

@@ -1,0 +1,157 @@
+"""Damaged and hostile files: every reader refuses them by a message that names the file, and runs nothing in them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from helpers import colmap_files, toy_object
+from helpers.plain import Call
+
+from data_prep.pack import pack
+from gausim.cli.main import main
+from gausim.core import GausSimError
+from gausim.data.objects import ObjectData
+from gausim.interaction.selections import Ball
+from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Reset, load_session, save_session
+from gausim.io.colmap import read_colmap
+from gausim.io.motion import load_motion, save_motion
+from gausim.io.npz import read_array
+from gausim.io.ply import load_masks, load_scene
+from gausim.io.trajectory import load_trajectory, save_trajectory
+from gausim.io.transforms import read_transforms
+from gausim.metrics import LPIPS
+from gausim.results.curves import load_curves
+from gausim.results.pictures import load_pictures
+from gausim.results.summary import load_summary
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.runs.directory import RunDirectory
+
+SCENE = toy_object.toy_scene()
+
+
+def whole(path: Path) -> object:
+    """Reads all of the object that a file belongs to."""
+    data = ObjectData(next(p for p in path.parents if (p / "dataset.json").is_file()))
+    record = data.sequences[0]
+    return record.cameras, record.frames(range(1)), data.ground_truth(record), data.rest_points
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "last.ckpt": read_checkpoint, "config.yaml": lambda path: RunDirectory(path.parent).config(),
+    "metrics.npz": load_curves, "pictures.npz": load_pictures, "metrics.json": load_summary, "lpips.safetensors": LPIPS,
+    "ground_truth.npz": lambda path: read_array(path, "payload"), "transforms.json": read_transforms,
+    "scene.ply": load_scene, "scene.masks.npz": lambda path: load_masks(SCENE, path), "m.motion.glb": load_motion,
+    "trajectory.safetensors": load_trajectory, "dataset.json": whole, "session.json": load_session,
+}  # fmt: skip
+
+
+def saved(save: Callable[[io.BytesIO], object]) -> bytes:
+    buffer = io.BytesIO()
+    save(buffer)
+    return buffer.getvalue()
+
+
+CONTENTS: dict[str, Callable[[Call], bytes]] = {
+    "pickle": lambda call: pickle.dumps({"payload": call}, protocol=2),
+    "torch": lambda call: saved(lambda f: torch.save({"payload": call}, f)),
+    "npz": lambda call: saved(lambda f: np.savez(f, payload=np.array([call], dtype=object))),
+    "yaml": lambda call: f'payload: !!python/object/apply:os.system ["{call.call[1][0]}"]\n'.encode(),
+    "nothing": lambda call: b"",
+}
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("name", READERS)
+def test_no_reader_runs_what_is_in_a_file(name: str, content: str, tmp_path: Path) -> None:
+    path, canary = tmp_path / name, tmp_path / "canary"
+    path.write_bytes(CONTENTS[content](Call(os.system, f"touch '{canary}'")))
+    with pytest.raises(GausSimError, match=str(tmp_path)):
+        READERS[name](path)
+    assert not canary.exists()
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Callable[[Path], object]]:
+    """Files that can be read, and their readers."""
+    root = tmp_path_factory.mktemp("good")
+    toy = toy_object.write_toy_object(root / "toy", frames=8)
+    pack(toy.root, root / "store")
+    truth = toy.truth("seq_000", 3)
+    save_motion(root / "m.motion.glb", SCENE, truth)
+    save_trajectory(root / "trajectory.safetensors", truth)
+    push = Force(on=Ball((0.0, 0.0, 1.0), 0.2), direction=(1.0, 0.0, 0.0), weights=2.0, frames=3)
+    made = MadeWith("toy", "0" * 64, "1" * 64, "2" * 64)
+    save_session(ForceSession(made, 24.0, 8, (Entry(1, push), Entry(6, Reset())), 9.81), root / "session.json")
+    found = {root / name: READERS[name] for name in ("m.motion.glb", "trajectory.safetensors", "session.json")}
+    found |= {toy.root / "scene.ply": load_scene, toy.root / "scene.masks.npz": READERS["scene.masks.npz"]}
+    inside = ("dataset.json", "sequences/seq_000/transforms.json", "sequences/seq_000/ground_truth.npz")
+    found |= {toy.root / name: whole for name in inside}
+    found |= {root / "store/sequences/seq_000" / name: whole for name in ("frames.json", "view_0.npy")}
+    for kind in ("binary", "text"):
+        getattr(colmap_files, f"write_{kind}")(root / kind, *colmap_files.small_model())
+        found |= {path: lambda p: read_colmap(p.parent) for path in (root / kind).iterdir()}
+    return found
+
+
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """The bytes cut, doubled, overwritten, or with a number of a text replaced."""
+    at, size = rng.randrange(len(data)), rng.choice((1, 4, 8, 64))
+    at = at if rng.random() < 0.5 else at % min(len(data), 256)
+    word = rng.choice((b"\xff" * 8, b"\0" * 8, b"\0\0\xc0\x7f", b"NaN", b"-1", b"1e999", b"9" * 30, b'"x"', b"[]"))
+    changed = rng.choice((word, rng.randbytes(size)))
+    rest = rng.choice((data[at:], data[at + 1 :], data[at + len(changed) :]))
+    return rng.choice((data[:at], data[:at] + changed + rest, data[: at + size] + data[at:]))
+
+
+def test_damage_is_refused_by_name_or_harmless(good: dict[Path, Callable[[Path], object]]) -> None:
+    refused = 0
+    for path, read in good.items():
+        content, rng = path.read_bytes(), random.Random(path.name)
+        read(path)
+        for _ in range(40):
+            path.write_bytes(damaged(content, rng))
+            try:
+                read(path)
+            except GausSimError as error:
+                assert str(path.parent) in str(error)
+                refused += 1
+        path.write_bytes(content)
+    assert refused > 20 * len(good)
+
+
+SYSTEM = {"_target_": "os.system", "command": "touch canary"}
+TEXT = {"_target_": "torch.fx.graph_module._exec_with_source", "src": "open('canary', 'w')", "globals": {}}
+HANDLER = {"version": 1, "handlers": {"evil": {"()": "os.system", "command": "touch canary"}}}
+
+
+@pytest.mark.parametrize("node", [SYSTEM, TEXT], ids=lambda node: node["_target_"])
+def test_a_run_of_others_builds_nothing_else(node: dict, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    parts = {name: {} for name in ("model", "loss", "optimizer", "render", "trainer", "paths")}
+    parts["model"] = {"simulator": node, "initial_states": {}}
+    config = {**parts, "seed": 0, "name": "evil", "data": node, "callbacks": {"evil": node}}
+    Path("run").mkdir()
+    Path("run/config.yaml").write_text(yaml.safe_dump(config))
+    torch.save({"state_dict": {}, "gausim": {}}, "run/last.ckpt")
+    assert main(["evaluate", "run"]) == 2 and "_target_: expected" in capsys.readouterr().err
+    assert main(["train", "--config-dir", "run", "--config-name", "config", "hydra.run.dir=again/seed_0"]) == 2
+    assert not Path("canary").exists()
+
+
+@pytest.mark.parametrize("part", [{"callbacks": {"callbacks": {"evil": TEXT}}}, {"job_logging": HANDLER},
+                                  {"job": {"env_set": {"PATH": "/evil"}}}], ids=json.dumps)  # fmt: skip
+def test_hydra_builds_nothing_else_for_itself(part: dict, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("evil.yaml").write_text(yaml.safe_dump({"defaults": ["train", "_self_"], "hydra": part}))
+    assert main(["train", "--config-dir", ".", "--config-name", "evil", "data.root=nowhere"]) == 2
+    assert "hydra." in capsys.readouterr().err and not Path("canary").exists()
