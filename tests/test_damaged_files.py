@@ -33,7 +33,7 @@ from gausim.metrics import LPIPS
 from gausim.results.curves import load_curves
 from gausim.results.pictures import load_pictures
 from gausim.results.summary import load_summary
-from gausim.runs.checkpoint import read_checkpoint
+from gausim.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 from gausim.runs.directory import RunDirectory
 
 SCENE = toy_object.toy_scene()
@@ -142,7 +142,7 @@ def test_a_run_of_others_builds_nothing_else(node: dict, tmp_path: Path, monkeyp
     config = {**parts, "seed": 0, "name": "evil", "data": node, "callbacks": {"evil": node}}
     Path("run").mkdir()
     Path("run/config.yaml").write_text(yaml.safe_dump(config))
-    torch.save({"state_dict": {}, "gausim": {}}, "run/last.ckpt")
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {}}, "run/last.ckpt")
     assert main(["evaluate", "run"]) == 2 and "_target_: expected" in capsys.readouterr().err
     assert main(["train", "--config-dir", "run", "--config-name", "config", "hydra.run.dir=again/seed_0"]) == 2
     assert not Path("canary").exists()
