@@ -12,7 +12,6 @@ from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.batch import ranges
 from gausim.render.cpu.shading import shade, shade_adjoint
-from gausim.render.cpu.simd import LANES
 from gausim.render.draw import deformed_appearance as operation
 
 # Tasks of one call: constants, so that loss gradients do not depend on the number of threads.
@@ -42,25 +41,16 @@ def deformed_appearance(
     return found
 
 
-def _lanes(rows: Tensor) -> Any:
-    """(n, ...) as (blocks, numbers per kernel, LANES), the last block padded with zeros."""
-    flat = rows.detach().reshape(rows.shape[0], -1).numpy()
-    blocks = -(-flat.shape[0] // LANES)
-    padded = np.zeros((blocks * LANES, flat.shape[1]), np.float32)
-    padded[: flat.shape[0]] = flat
-    return np.ascontiguousarray(padded.reshape(blocks, LANES, -1).transpose(0, 2, 1))
-
-
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, positions: Tensor, deformation_gradients: Tensor, rotations: Tensor, *rest: Any) -> Any:
         unit, covars, sh, centers, pool = rest
         states, count = positions.shape[:2]
         inputs = [array(x) for x in (positions, deformation_gradients, rotations)]
-        fixed = array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, array(centers)
+        fixed = array(unit), array(covars), array(sh), round(sh.shape[1] ** 0.5) - 1, array(centers)
         out_covars = np.empty((states, count, 3, 3), np.float32)
         out_colors = np.empty((states, centers.shape[0], count, 3), np.float32)
-        cuts = ranges(fixed[1].shape[0], max(1, -(-FORWARD_TASKS // states)))
+        cuts = ranges(count, max(1, -(-FORWARD_TASKS // states)))
 
         def task(item: tuple[int, tuple[int, int]]) -> None:
             b, part = item
@@ -78,7 +68,7 @@ class _Shade(torch.autograd.Function):
         positions, deformation_gradients, _ = ctx.saved_tensors
         states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
         given = array(grad_covars), array(grad_colors)
-        cuts = ranges(fixed[1].shape[0], max(1, -(-BACKWARD_TASKS // states)))
+        cuts = ranges(positions.shape[1], max(1, -(-BACKWARD_TASKS // states)))
         moved = np.empty(positions.shape, np.float32)
         of_units = np.zeros((2, states, len(cuts), *deformation_gradients.shape[1:]), np.float32)
 

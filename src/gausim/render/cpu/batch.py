@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from gausim.core.errors import DivergenceError
 from gausim.kernels.pool import WorkerPool
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, bin_band
-from gausim.render.cpu.projection import EXTENT, RECORD, count_unusable, depth_order, project_adjoint, project_kernels
-from gausim.render.cpu.raster import BLOCKS, PIXELS, SUMS, backward_band, forward_band
+from gausim.render.cpu.projection import (
+    EXTENT,
+    RECORD,
+    SUMS,
+    count_unusable,
+    depth_order,
+    project_adjoint,
+    project_kernels,
+)
+from gausim.render.cpu.raster import PIXELS, backward_band, forward_band
 
 Array = NDArray[Any]
 
@@ -223,7 +231,7 @@ class Batch:
         )  # fmt: skip
         tiles = start.shape[0] - 1
         final, last = np.empty((tiles, PIXELS), np.float32), np.empty((tiles, PIXELS), np.float32)
-        return Band((records, entries, start, rows[0]), (final, last, np.empty((tiles, BLOCKS + 1), np.int64)))
+        return Band((records, entries, start, rows[0]), (final, last, np.empty(tiles, np.int64)))
 
     def composite_adjoint(self, grads: Images, background: Array | None, item: tuple[int, int, int]) -> None:
         """Sums the loss gradients of a band's pixels for each of its kernels; ``item`` = (b, v, band)."""

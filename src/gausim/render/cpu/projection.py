@@ -10,7 +10,6 @@ import numba
 import numpy as np
 
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
-from gausim.render.cpu.simd import LANES, load, splat, store
 from gausim.render.reference import ALPHA_MIN, CLAMP_MARGIN, DILATION
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
@@ -22,10 +21,10 @@ EXTENT = 8
 SLACK = 0.002  # [pixels] added to every extent, far above the rounding error of extents up to some thousand pixels,
 RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
 
-# Positions in a row of sums of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth over pixels: in the
-# order in which raster.add_sums folds them.
-S, S_X, S_XX, S_Y, S_XY, S_YY = 0, 4, 2, 8, 12, 6
-S_RED, S_GREEN, S_BLUE, S_DEPTH = 1, 9, 14, 5
+# Positions in a row of sums over pixels: of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth.
+S, S_X, S_XX, S_Y, S_XY, S_YY, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(10)
+SUMS = 10
+ZERO = np.float32(0)
 AT_ONCE = 64  # kernels whose sums are gathered before they are used
 
 
@@ -175,13 +174,14 @@ def gather_sums(low, high, depth, spans, band_of, row_of, offsets, sums, totals)
 
     A separate loop, because its reads are scattered over more memory than the caches have: many can overlap.
     """
-    rows, flat = sums.reshape(-1), totals.reshape(-1)
     for k in range(low, high):
-        found = splat(np.float32(0))
+        for j in range(SUMS):
+            totals[k - low, j] = ZERO
         if depth[k] >= 0.0:
             for i in range(band_of[spans[k, 0]], band_of[spans[k, 1]] + 1):
-                found += load(rows, (offsets[i] + row_of[i, k]) * LANES)
-        store(flat, (k - low) * LANES, found)
+                row = offsets[i] + row_of[i, k]
+                for j in range(SUMS):
+                    totals[k - low, j] += sums[row, j]
 
 
 @numba.njit(fastmath=True, **KERNEL)
@@ -198,7 +198,7 @@ def project_adjoint(
     With m0, m1, m11, m2, m12, m22 the sums over pixels of s, s dx, ..: dL/do = m0 / o, dL/dmean2d = Q (m1, m2),
     G_Q = -1/2 [[m11, m12], [m12, m22]], G_S = -Q G_Q Q, dL/dSigma = M^T G_S M, dL/dM = 2 G_S M Sigma, then through J.
     """
-    frame, totals = np.empty(22, np.float64), np.empty((AT_ONCE, LANES), np.float32)
+    frame, totals = np.empty(22, np.float64), np.empty((AT_ONCE, SUMS), np.float32)
     grad_row0, grad_row1 = np.empty(3, np.float64), np.empty(3, np.float64)
     for k in range(low, high):
         if (k - low) % AT_ONCE == 0:
