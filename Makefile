@@ -88,7 +88,7 @@ report: install ## Tables, figures and videos: make report DIRS="outputs/a outpu
 	$(BIN)/gausim report $(DIRS) $(ARGS)
 
 benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at tiny sizes, to see that it works)
-	$(BIN)/gausim benchmark $(or $(ARGS),all --quick)
+	$(BIN)/python -m benchmarks $(or $(ARGS),all --quick)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, and a page about it
 	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train experiment=demo trainer.max_epochs=6
@@ -97,4 +97,4 @@ demo: data ## From nothing to a simulator that foresees: install, make data, tra
 
 clean: ## Remove caches and builds (not .venv, data or outputs)
 	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
-	find src tests data_prep -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src tests data_prep benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

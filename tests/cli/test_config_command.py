@@ -192,7 +192,6 @@ def test_what_is_no_configuration(what: list[str], message: str, tmp_path, monke
         ("train sed=1 model.simu", set()),  # beside what is wrong nothing composes
         ("config validate experiment=demo_", {"experiment=demo_tiny"}),
         ("adapt RUN --set trainer.max_e", {"trainer.max_epochs="}),
-        ("benchmark train experiment=demo_", {"experiment=demo_tiny"}),
     ],
 )  # fmt: skip
 def test_what_may_follow(line: str, expected: set[str]) -> None:

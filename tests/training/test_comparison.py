@@ -10,7 +10,7 @@ import torch
 from helpers import sway, toy_object
 from torch import Tensor
 
-from gausim.benchmark.train import peak_saved_bytes
+from benchmarks.harness import peak_saved_bytes
 from gausim.core import GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.losses import ImageLoss

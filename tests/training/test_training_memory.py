@@ -13,7 +13,7 @@ from helpers.sway import blobs, sample, sway_module
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gausim.benchmark.train import peak_saved_bytes
+from benchmarks.harness import peak_saved_bytes
 from gausim.losses import Objective
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings

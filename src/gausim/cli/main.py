@@ -22,7 +22,6 @@ COMMANDS = {
     "train": "Learn an object's dynamics from multi-view videos.",
     "adapt": "Fit initial states of new sequences to their first frames, with a trained run frozen.",
     "evaluate": "Measure a run on seen, unseen and held-out frames.",
-    "benchmark": "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     "simulate": "Roll a run forward and write videos, figures and trajectories.",
     "view": "Simulate a run or a scene interactively in the browser.",
     "export": "Write a motion as HTML that plays it, glTF, PLY, OpenUSD, safetensors, viser, MP4 or GIF, and read it.",

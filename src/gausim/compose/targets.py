@@ -33,7 +33,6 @@ ALLOWED_PACKAGES = (
 ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
 # Exceptions inside the allowed packages, which start programs or write files.
 REFUSED_MODULES = (
-    "gausim.benchmark",
     "gausim.cli",
     "gausim.data.images",
     "gausim.runs.checkpoint",

@@ -1,0 +1,92 @@
+"""Training: sequence-steps per second of whole optimiser steps, fast forms against plain ones, memory of the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch.optim import Optimizer
+
+from benchmarks.harness import Options, Row, medians, peak_saved_bytes
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.dataset import SequenceSample
+from gausim.kernels.operations import OPERATIONS, plain_forms
+from gausim.runs.cost import process_memory
+from gausim.training.module import GausSimModule
+
+SEQUENCES = 4  # of an optimiser step, at most
+SLOW_ROUNDS = 2  # timed steps of plain torch
+OVERRIDES, RIVAL = ("experiment=demo", "model=gausim"), "model=gausim_elastic"
+
+
+def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
+    """Optimiser steps of a training configuration (KEY=VALUE) against those of the model in ``RIVAL``.
+
+    Raises:
+        DataError: the data set is not there.
+    """
+    from gausim.compose.build import build
+    from gausim.compose.config import compose
+
+    words = list(overrides or OVERRIDES)
+    own, rival = compose("train", words), compose("train", [*(w for w in words if not w.startswith("model")), RIVAL])
+    module, data = build(own)
+    return measure(options, module, data, {} if own.model == rival.model else {RIVAL: build(rival)[0]})
+
+
+@dataclass
+class _Case:
+    """A module with a batch and an optimiser of rate zero, so that all steps are equal."""
+
+    module: GausSimModule
+    samples: list[SequenceSample]
+    optimizer: Optimizer
+
+    @staticmethod
+    def of(module: GausSimModule, data: ReadyDataModule, options: Options, steps: int) -> _Case:
+        chosen = range(min(SEQUENCES, len(data.index)))
+        views = [data.index.objects[data.index.entries[i][0]].train_views for i in chosen]
+        frames = range(steps + 1)
+        samples = [data.index.sample(i, frames, v).to(options.device) for i, v in zip(chosen, views, strict=True)]
+        module.to(options.device).train()
+        module.measuring = False  # gradient fractions are measured in every fiftieth step only
+        module.objective = replace(module.objective, static_probability=0.0)
+        optimizer = module.configure_optimizers()
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0
+        return _Case(module, samples, optimizer)
+
+    def step(self) -> None:
+        """One optimiser step without the static loss, which only some batches have."""
+        self.module.optimise(self.samples, self.optimizer, torch.Generator().manual_seed(0))
+
+
+def measure(
+    options: Options, module: GausSimModule, data: ReadyDataModule, others: Mapping[str, GausSimModule]
+) -> list[Row]:
+    """Times of optimiser steps, and memory, at the curriculum's largest T; weights stay constant.
+
+    ``others`` are modules of the same data for comparison, by the setting that selects them.
+    """
+    data.setup("fit")
+    steps = min(3, data.curriculum.t_max) if options.quick else data.curriculum.t_max
+    case = _Case.of(module, data, options, steps)
+    cameras = case.samples[0].cameras
+    size = f"{len(cameras.names)} views x {cameras.width}x{cameras.height}, T={steps}"
+    name = f"{case.samples[0].object_name}: {len(case.samples)} sequences x {size}"
+    whole = medians({"": case.step}, options)[""]
+    calls: dict[str, Callable[[], object]] = {"own": case.step, "plain": plain_forms()(case.step)}
+    calls |= {form: plain_forms([form])(case.step) for form in OPERATIONS}
+    calls |= {setting: _Case.of(other, data, options, steps).step for setting, other in others.items()}
+    found = medians(calls, replace(options, rounds=min(SLOW_ROUNDS, options.rounds)))
+    rows = [Row(name, "throughput", steps * len(case.samples) / whole, "sequence-steps/s")]
+    rows.append(Row(name, "optimiser step", 1e3 * whole, "ms"))
+    rows += [Row(name, f"throughput / {setting}", found[setting] / found["own"], "x", "same run") for setting in others]
+    plain = "every operation but the renderer as plain torch"
+    rows.append(Row(name, "throughput / plain", found["plain"] / found["own"], "x", plain))
+    rows += [Row(name, f"speed-up by {form}", found[form] / found["own"], "x", "its plain form") for form in OPERATIONS]
+    rows.append(Row(name, "held for the backward pass, at most", peak_saved_bytes(case.step) / 2**20, "MiB"))
+    on_gpu = options.device.type == "cuda"
+    held = torch.cuda.max_memory_allocated(options.device) if on_gpu else process_memory("VmHWM") or 0
+    return [*rows, Row(name, f"{'device' if on_gpu else 'process'} memory, at most", held / 2**20, "MiB")]
