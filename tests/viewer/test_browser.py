@@ -46,7 +46,7 @@ def opened(subject: Subject, folder: Path) -> Iterator[tuple[Viewer, Page]]:
             home = (viewer.url, viewer.url.replace("http", "ws"), "data:", "blob:")
             outside = [address for address in page.requests if not address.startswith(home)]
             assert not outside, outside
-            assert viewer.live.is_alive() and viewer.server.junk == viewer.server.failed == 0
+            assert viewer.live.is_alive() and not any(worker.failures for worker in viewer.workers)
     finally:
         viewer.stop()
 

@@ -1,16 +1,13 @@
-"""Access control of the viewer: checks of address, Host, Origin, token and path."""
+"""Access to the viewer: its address, and the check of Host, Origin, path and token of every request."""
 
 from __future__ import annotations
 
-import contextlib
 import hmac
 import re
 import secrets
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from http.cookies import CookieError, SimpleCookie
-from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -19,19 +16,12 @@ from websockets.http11 import Request, Response
 
 from gausim.core.errors import ConfigError
 
-# Paths of the client's build; all others are answered by 404.
-PATHS = ("/", "/index.html")
-# No requests to other origins, and no other page may frame this one.
-CONTENT_POLICY = (
-    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
-    "style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob:; worker-src 'self' data: blob:; "
-    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
-)
-_HEADERS = {
-    "Content-Security-Policy": CONTENT_POLICY, "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer", "Cross-Origin-Resource-Policy": "same-origin", "Cache-Control": "no-store",
-}  # fmt: skip
 MOST_CLIENTS = 16
+# No requests to other origins, and no other page may frame this one.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'none'", "Referrer-Policy": "no-referrer", "Cache-Control": "no-store",
+}  # fmt: skip
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 
 
@@ -43,37 +33,20 @@ class Access:
     port: int = 8080  # TCP port; 0 takes a free one
     remote: bool = False  # allow addresses that other machines can reach; a token is then required
     names: tuple[str, ...] = ()  # further host names of the page
-    # token of the first request (``?token=...``); generated for remote addresses; None: not required
-    token: str | None = None
+    token: str | None = None  # of the first request (``?token=...``); made for remote addresses; None: not required
 
     def checked(self) -> Access:
         """Returns the settings, with a generated token where one is required.
 
         Raises:
-            ConfigError: address, port or token is invalid, or other machines can reach it and ``remote`` is not set.
+            ConfigError: the token is invalid, or other machines can reach the address and ``remote`` is not set.
         """
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port {self.port}: expected 0..65535 (0 takes a free port).")
-        try:
-            loopback = self.host == "localhost" or ip_address(self.host).is_loopback
-        except ValueError as error:
-            raise ConfigError(f"--host {self.host!r}: expected an IP address, e.g. 127.0.0.1.") from error
+        loopback = self.host in ("localhost", "127.0.0.1", "::1")
         if not loopback and not self.remote:
-            raise ConfigError(
-                f"--host {self.host}: other machines could reach the viewer there. Add --allow-remote if they shall "
-                "(a token is then required), or go through `ssh -L 8080:127.0.0.1:8080 MACHINE`."
-            )
+            raise ConfigError(f"--host {self.host}: other machines could reach it. Add --allow-remote if they shall.")
         if self.token is not None and (len(self.token) < 16 or not self.token.isascii() or not self.token.isalnum()):
             raise ConfigError("the token has to be at least 16 letters and digits; leave it out to have one made.")
         return self if loopback or self.token is not None else replace(self, token=secrets.token_hex(24))
-
-    def host_names(self) -> set[str]:
-        """Allowed names in the header Host; any port is allowed, as a tunnel changes it."""
-        address = ip_address("127.0.0.1" if self.host == "localhost" else self.host)
-        names = {"localhost", *map(str.lower, self.names), f"[{address}]" if address.version == 6 else str(address)}
-        if address.is_loopback or address.is_unspecified:
-            names |= {"127.0.0.1", "[::1]"}
-        return names | ({socket.gethostname().lower()} if address.is_unspecified else set())
 
 
 def answer(
@@ -83,7 +56,8 @@ def answer(
     websocket = "upgrade" in request.headers
     # A cookie replaces the token, so that the token does not stay in the address bar.
     given = "" if websocket else parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-    refusal = _refusal(access, given or _cookie(request, cookie), connection, request)
+    known = re.search(rf"(?:^|;\s*){cookie}=([^;]*)", "; ".join(request.headers.get_all("Cookie")))
+    refusal = _refusal(access, given or (known[1] if known else ""), connection, request)
     if refusal is not None:
         response: Response = connection.respond(refusal[0], f"{refusal[1]}\n")
     elif websocket:
@@ -94,8 +68,7 @@ def answer(
         response.headers["Set-Cookie"] = f"{cookie}={access.token}; HttpOnly; SameSite=Strict; Path=/"
     else:
         response = serve_page(connection, request)
-    for name, value in _HEADERS.items():
-        response.headers[name] = value
+    response.headers.update(_HEADERS)
     return response
 
 
@@ -104,24 +77,17 @@ def _refusal(access: Access, token: str, connection: ServerConnection, request: 
     websocket, headers = "upgrade" in request.headers, request.headers
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     host = hosts[0].strip().lower() if len(hosts) == 1 else ""
-    match = _HOST.fullmatch(host)
-    if match is None or match[1] not in access.host_names():
+    match, address = _HOST.fullmatch(host), f"[{access.host}]" if ":" in access.host else access.host
+    # Any port is allowed, as a tunnel changes it.
+    allowed = {"localhost", "127.0.0.1", "[::1]", socket.gethostname(), address, *access.names}
+    if match is None or match[1] not in map(str.lower, allowed):
         return 421, "wrong host"
-    own = (f"http://{host}", f"https://{host}")
-    if (websocket and len(origins) != 1) or any(o.strip().lower() not in own for o in origins):
+    if (websocket and len(origins) != 1) or any(o not in (f"http://{host}", f"https://{host}") for o in origins):
         return 403, "wrong origin"
-    if request.path.partition("?")[0] not in PATHS:
+    if request.path.partition("?")[0] not in ("/", "/index.html"):
         return 404, "not found"
     if websocket and len(connection.server.connections) >= MOST_CLIENTS:
         return 503, "too many clients"
     if access.token is not None and not hmac.compare_digest(token.encode(), access.token.encode()):
         return 401, "open the address with ?token=..., as gausim printed it"
     return None
-
-
-def _cookie(request: Request, name: str) -> str:
-    jar = SimpleCookie()
-    with contextlib.suppress(CookieError):
-        for line in request.headers.get_all("Cookie"):
-            jar.load(line)
-    return jar[name].value if name in jar else ""

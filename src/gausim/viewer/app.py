@@ -16,7 +16,7 @@ from gausim.viewer.camera_panel import CameraPanel
 from gausim.viewer.coloring import VIEW, Legend, Painter, highlighted
 from gausim.viewer.live import Live
 from gausim.viewer.page import Page
-from gausim.viewer.pipeline import Worker
+from gausim.viewer.pipeline import Rate, Worker
 from gausim.viewer.pointer import Pointer
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.shown import Shown
@@ -67,10 +67,9 @@ class Viewer:
         self.page = Page(self.server, self.live, self.pointer, subject, painter, self.repaint)
         self.camera_panel = CameraPanel(self.server, self.placing, subject)
         self.eye = torch.tensor(self.camera_panel.first_position, dtype=torch.float32)
-        self._viewed = 0.0
+        self._viewed, self._sent = 0.0, Rate()
         self._place_beside(subject)
         first = self._paint_now(self.live.shown())
-        self.server.frame_bytes = first.buffers[0].nbytes
         names = ("/splats", "/beside")
         self._splats = [add_splats(self.server.scene, *shown) for shown in zip(names, first.buffers, strict=False)]
         self.server.on_client_connect(self._connected)
@@ -151,7 +150,8 @@ class Viewer:
                 if buffer is not None:
                     splats.buffer = buffer
             self.pointer.follow(painted.shown)
+        self._sent.count()
         paused = not self.live.playing  # this frame must be displayed, as no other may follow
-        displayed = 0.0 if paused else self.server.displayed
+        displayed = 0.0 if paused else self._sent.per_second
         self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
         self.camera_panel.refresh(painted.shown, now=paused)
