@@ -57,18 +57,13 @@ def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, c
     assert count == 3 and fps == 12.0 and [torch.equal(s.means, expected[2 * i].means) for i, s in enumerate(scenes)]
 
 
-def test_usd_and_back(run) -> None:
+def test_usd_and_what_frames_without_units_cannot_become(run) -> None:
     pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
     assert export.main([str(run.run_dir), "--format", "usd", "--frames", "4", "--out", "m.usdc"]) == 0
-    assert export.main(["m.usdc", "--format", "ply", "--out", "p"]) == 0
-    scenes, count, fps = load_ply_sequence("p")
-    whole = run.module.predict(0, 3)
-    assert count == 4 and fps == 24.0
-    for scene, positions in zip(scenes, whole.positions, strict=True):
-        assert torch.equal(scene.means, positions)
+    assert export.main([str(run.run_dir), "--format", "ply", "--frames", "4", "--out", "p"]) == 0
     for form in ("safetensors", "motion", "html"):
-        with pytest.raises(ConfigError, match=f"--format {form}: m.usdc holds frames without units"):
-            export.main(["m.usdc", "--format", form])
+        with pytest.raises(ConfigError, match=f"--format {form}: p holds frames without units"):
+            export.main(["p", "--format", form])
 
 
 def test_pictures(run) -> None:

@@ -50,8 +50,8 @@ def _parser() -> argparse.ArgumentParser:
         rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
     parser = command_parser("export", epilog="formats:\n" + "\n".join(rows))
     add = parser.add_argument
-    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a .motion.glb; a "
-        "folder of name_0001.ply, ...; or a .usd, .usda, .usdc file")  # fmt: skip
+    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a .motion.glb; "
+        "or a folder of name_0001.ply, ...")  # fmt: skip
     add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
     add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply and gltf); default NAME.SUFFIX here")
     add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
@@ -75,12 +75,8 @@ def _parser() -> argparse.ArgumentParser:
 def _opened(arguments: argparse.Namespace) -> Motion:
     from gausim.io.motion import load_motion
     from gausim.io.ply_sequence import load_ply_sequence
-    from gausim.io.usd import SUFFIXES, load_usd
 
     source: Path = arguments.source
-    if source.suffix in SUFFIXES:
-        clip = load_usd(source)
-        return Motion(source.stem, clip.fps, clip.frames, clip.scenes, next(clip.scenes()))
     if source.is_dir() and not (source / "config.yaml").is_file():
         scenes, count, fps = load_ply_sequence(source, fps=arguments.fps)
         return Motion(source.name, fps, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
