@@ -32,8 +32,7 @@ FILES = sorted(
     path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml") if path.parent.name != "base"
 )
 # Searches of one method each, which are composed with the values that they try.
-TRIALS = [path for path in FILES if path.parts[:2] == ("sweep", "trials")]
-OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1 and path not in TRIALS]
+OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
@@ -160,22 +159,6 @@ def sweep_of(path: Path) -> dict[str, list[str]]:
     node = yaml.safe_load((conf_dir() / path.with_suffix(".yaml")).read_text())
     params = node["hydra"]["sweeper"]["params"]
     return {key: re.findall(r"\[[^]]*\]|[^,]+", str(value)) for key, value in params.items()}
-
-
-def test_every_method_of_the_comparison_gets_the_same_number_of_trials() -> None:
-    comparison = sweep_of(Path("experiment/tables/comparison"))
-    declared = compose("train", ["experiment=tables/comparison"]).protocol.trials
-    assert {path.name for path in TRIALS} == set(comparison["method"]) - {"static"}
-    objects = [name.replace("_test", "_development") for name in comparison["protocol"] if name != "object_test"]
-    for path in TRIALS:
-        params = sweep_of(path)
-        assert params.pop("protocol") == objects
-        assert math.prod(map(len, params.values())) == declared == 4, path
-        picked = [f"{key}={v[-1]}" for key, v in params.items()]
-        config = compose("train", [f"sweep=trials/{path.name}", f"protocol={objects[0]}", *picked])
-        assert config.protocol.part == "development" and config.data.sequences[-1] == "seq_007"
-        for key, values in params.items():
-            assert str(OmegaConf.select(config, key)) == str(yaml.safe_load(values[-1])), (path, key)
 
 
 TABLES = [path for path in FILES if path.parts[:2] == ("experiment", "tables")]

@@ -1,17 +1,11 @@
-"""Sweepers for Hydra, which searches this namespace. Every Hydra program loads this file, so it imports lazily."""
+"""The sweeper for Hydra, which searches this namespace. Every Hydra program loads this file, so it imports lazily."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.plugins import Plugins
-from hydra.plugins.sweeper import Sweeper
-
-if TYPE_CHECKING:
-    from hydra.types import HydraContext, TaskFunction
-    from omegaconf import DictConfig
 
 
 class GridSweeper(BasicSweeper):
@@ -49,24 +43,3 @@ class GridSweeper(BasicSweeper):
                 f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
             )
         conclude(folder, results)
-
-
-class OptunaSweeper(Sweeper):
-    """A search by Optuna that can be continued after a kill (`hydra/sweeper=optuna`)."""
-
-    def __init__(self, **settings: Any) -> None:
-        """Stores the settings, documented in conf/hydra/sweeper/optuna.yaml."""
-        self._settings = settings
-
-    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Builds the launcher."""
-        self.hydra_context, self.config = hydra_context, config
-        self._launcher = Plugins.instance().instantiate_launcher(hydra_context, task_function, config)
-
-    def sweep(self, arguments: list[str]) -> None:
-        """Trains one trial after another."""
-        from gausim.cli.sweeps.optuna import Search, SearchSettings
-
-        assert self.config is not None and self.hydra_context is not None
-        settings = SearchSettings(**self._settings)
-        Search(self.config, self.hydra_context, self._launcher, settings).run(arguments)

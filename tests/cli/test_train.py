@@ -63,7 +63,7 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     assert "36 kernels" in told and "warning: in 2 shows at optimizer.initial_lr=" in told
     assert "WARNING  extent" in told and "frames of each sequence only" in told and "NOTE" not in told
     result, address, *following = told.splitlines()[-4:]
-    assert result.startswith("Trained for 2 epochs (") and "times that of a model that predicts no motion" in result
+    assert result.startswith("Trained for 2 epochs (") and "% of the static prediction's" in result
     assert address == f"run: {RUN.resolve().as_uri()}"
     assert [line.split("gausim ")[1].split()[0] for line in following] == ["evaluate", "report"]
     loaded = load_run(RUN)
@@ -132,8 +132,8 @@ def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str],
 
 
 def test_a_sweep_by_a_single_training_is_refused(arguments: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"learning_rates is several trainings\. Add -m"):
-        command.main([*arguments, "sweep=learning_rates"])
+    with pytest.raises(ConfigError, match=r"ablations is several trainings\. Add -m"):
+        command.main([*arguments, "sweep=ablations"])
 
 
 @pytest.mark.usefixtures("again")

@@ -115,7 +115,7 @@ def test_a_directory_that_cannot_be_written_is_named(trainings: Trainings) -> No
 
 @pytest.mark.slow
 def test_twenty_kills_at_random_moments(trainings: Trainings) -> None:
-    settings = ("trainer=cpu", "trainer.max_epochs=100", "trainer.convergence=null", "render=cpu", "data.repeats=4")
+    settings = ("trainer=cpu", "trainer.max_epochs=100", "render=cpu", "data.repeats=4")
     undisturbed = trainings.whole("undisturbed", *settings)
     moments, kills, steps, seen, patience = random.Random(0), 0, set(), 0, 0.6
     run, status, output = trainings.run("disturbed"), -9, ""

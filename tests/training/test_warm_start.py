@@ -21,7 +21,7 @@ from gausim.training.optimizers import OptimizerSettings
 
 QUICK = [x for x in SMALLEST if "warm_start" not in x] + [
     "model.simulator.template.modes=6", "render=cpu", "logger=none", "callbacks.motion=null", "evaluate=false",
-    "data.curriculum.t_max=4", "data.repeats=1", "data.batch_size=1", "+trainer.convergence.held_back=1",
+    "data.curriculum.t_max=4", "data.repeats=1", "data.batch_size=1",
 ]  # fmt: skip
 
 

@@ -90,7 +90,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "init_from": str(run.resolve()),
         "freeze": "model",
         "evaluate": True,
-        "trainer": config["trainer"] | {"max_epochs": arguments.epochs, "max_minutes": None, "convergence": None},
+        "trainer": config["trainer"] | {"max_epochs": arguments.epochs, "max_minutes": None},
         "overwrite": False,
     }
     if arguments.supervision is not None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
@@ -27,14 +27,14 @@ from gausim.doctor.page import findings_text
 from gausim.models.step.simulator import GausSim
 from gausim.results.looks import DEVELOPMENT, TEST_PART
 from gausim.runs.directory import RunDirectory
-from gausim.training.callbacks.convergence import Convergence
-from gausim.training.callbacks.time_budget import EpochJudge
+from gausim.runs.names import EPOCHS
 from gausim.training.callbacks.warm_start import WarmStart
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.fitted.fitting import StagedFit
 from gausim.training.material_scan import find_materials
 from gausim.training.module import GausSimModule
 from gausim.training.ranks.launch import Crew
+from gausim.training.table import Table
 from gausim.training.trainer import make_trainer
 from gausim.training.transfer import load_shared, load_simulator, unlike
 
@@ -71,7 +71,7 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
         objective = _train(cfg, run)
-    if cfg.evaluate and not run.was_pruned:
+    if cfg.evaluate:
         _evaluate(run)
     return objective
 
@@ -170,8 +170,7 @@ def _fit(
         raise KeyboardInterrupt
     if crew.is_first:
         facts = _facts(trainer, module) | ({"data_faults": faults} if faults else {})
-        pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
-        run.finish(facts | ({"pruned": True} if pruned else {}))
+        run.finish(facts)
         commands = [] if cfg.evaluate or not datamodule.has_videos else [["evaluate", run.path], ["report", run.path]]
         end(_result(facts), "run", run.path, *commands)
     return module.summary.get("excess_static")
@@ -184,27 +183,41 @@ def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:
     facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
     if isinstance(module.method, StagedFit):
         facts["notes"] = module.notes()
-    judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
-    return facts | ({"learning": judged[0]} if judged and judged[0] else {})
+    rows = Table(Path(trainer.default_root_dir) / EPOCHS, "epoch").rows()
+    full = [row for row in rows if row.get("excess_static") and row["steps"] == rows[-1]["steps"]]
+    falls = still_falls([float(row["excess_static"]) for row in full])
+    return facts | ({} if falls is None else {"still_falls": falls})
 
 
 def _result(facts: dict[str, Any]) -> list[str]:
-    """Sentences on the training time, the error on training frames, faults of the data, and convergence."""
+    """Sentences on the training time, the error on training frames, and faults of the data."""
     more = [
         f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
         "`gausim doctor ROOT` has the remedy."
         for fault in facts.get("data_faults", ())
     ]
-    more += [facts["learning"]["verdict"]] if "learning" in facts else []
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None or excess < -1:  # the motion is smaller than the error of the reconstruction
         return [f"{begin}.", *more]
+    falls = {True: " and still falls", False: " and no longer falls", None: ""}[facts.get("still_falls")]
     return [
-        f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
-        "model that predicts no motion.",
+        f"{begin}: on the training frames, the loss beyond that of the reconstruction is {excess:.0%} of the static "
+        f"prediction's{falls}.",
         *more,
     ]
+
+
+def still_falls(losses: Sequence[float], *, share: float = 0.2, tolerance: float = 0.01) -> bool | None:
+    """Whether the mean of the last ``share`` of the losses is lower than that before it by more than ``tolerance``.
+
+    None with fewer than two epochs in each part.
+    """
+    count = int(share * len(losses))
+    if count < 2:
+        return None
+    now, before = (sum(part) / count for part in (losses[-count:], losses[-2 * count : -count]))
+    return now < (1 - tolerance) * before
 
 
 def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
@@ -258,30 +271,12 @@ def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | No
 
     The epochs of a plan, if given, replace ``trainer.max_epochs``.
     """
-    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + _judges(cfg)
+    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node]
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
     loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs * run.allowances if epochs is None else epochs}
-    if cfg.trainer.max_minutes is not None:
-        length["max_minutes"] = cfg.trainer.max_minutes * run.allowances
+    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs if epochs is None else epochs}
     settings = instantiate(cfg.trainer, **length)
     return make_trainer(settings, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
-
-
-def _judges(cfg: DictConfig) -> list[EpochJudge]:
-    """Callbacks that may end the running job early: the pruner of its search, if any."""
-    sweeper = HydraConfig.get().sweeper if in_sweep() else {}
-    if sweeper.get("pruner") is None or sweeper.get("trial") is None:
-        return []
-    if (devices := cfg.trainer.get("devices", 1)) != 1:
-        raise ConfigError(
-            f"hydra.sweeper.pruner: expected trainer.devices=1, got {devices}. Train without a pruner "
-            "(hydra.sweeper.pruner=null)."
-        )
-
-    from gausim.cli.sweeps.optuna import pruning_judge  # Optuna is optional
-
-    return [pruning_judge()]
 
 
 def _introduce(

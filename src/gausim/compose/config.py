@@ -171,8 +171,6 @@ def _readable_errors(config_name: str) -> Iterator[None]:
             message = f"{message}\n{cause}"
         if "hydra/launcher/" in message:
             message += "\njoblib, submitit_local and submitit_slurm come with `pip install 'gausim[sweep]'`."
-        if "does not support sweep type" in message:
-            message += "\nA search takes intervals: hydra/sweeper=optuna."
         raise ConfigError(f"{config_name}.yaml: {message}{_close_keys(config_name, message)}") from error
 
 

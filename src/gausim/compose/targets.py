@@ -27,8 +27,6 @@ ALLOWED_PACKAGES = (
     "torchmetrics.regression",
     "kornia.losses",
     "kornia.metrics",
-    "optuna.pruners",
-    "optuna.samplers",
 )
 ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
 # Exceptions inside the allowed packages, which start programs or write files.
@@ -42,8 +40,8 @@ REFUSED_MODULES = (
     "gausim.report",
     "lightning.pytorch.strategies.launchers",
 )
-# Allowed in the node `hydra`: launchers, sweepers, samplers and pruners, and callbacks.
-HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim", "optuna.pruners", "optuna.samplers")
+# Allowed in the node `hydra`: launchers, sweepers and callbacks.
+HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim")
 _LOGGING_CLASS = re.compile(r"(logging|logging\.handlers|colorlog)\.[A-Z]\w*")
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 

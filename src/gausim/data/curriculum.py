@@ -19,7 +19,7 @@ class Curriculum:
     t_start: int = 1  # predicted steps in epoch 0
     t_max: int = USUAL  # most predicted steps; 15 use frames 0..15 and no unseen one; 0: all seen frames, at most MOST
     epochs_per_increase: int = 1  # epochs between increases
-    # current limit of predicted steps, at most ``t_max``; the convergence test lowers it to hold frames back
+    # most predicted steps, once the seen frames are known
     longest: int = field(default=0, init=False, repr=False)
     # whether rollouts are as long as possible from epoch 0 on, because training starts near the motion in the videos
     grown: bool = field(default=False, init=False, repr=False)

@@ -18,7 +18,6 @@ from gausim.io.files import write_durably
 from gausim.runs.names import LAST_CHECKPOINT
 
 PREVIOUS_CHECKPOINT = "last.previous.ckpt"
-BEFORE_THE_END = "before_the_end.ckpt"  # of a run stopped by its time limit: it can be continued from there
 DIGEST = "digest"
 
 

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import GausSimError, RunError
 from gausim.io.files import read_yaml, remove_leftovers, write_durably
-from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, read_checkpoint
+from gausim.runs.checkpoint import PREVIOUS_CHECKPOINT, read_checkpoint
 from gausim.runs.comparison import changed_keys
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
@@ -27,11 +27,10 @@ from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST
 from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
 
 LOCK, EVENTS = ".lock", "events.jsonl"
-GRANTED = "granted more"  # event: the run was granted further epochs and minutes
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # Files that `overwrite` removes; gausim made no others in the directory.
 OWN_FILES = (
-    CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, BEFORE_THE_END, DAMAGED_CHECKPOINT, EPOCHS,
+    CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS,
     MOTION, WANDB_ID, MLFLOW_ID,
 )  # fmt: skip
 OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
@@ -64,11 +63,6 @@ class RunDirectory:
     def has_failed(self) -> bool:
         """Whether an error ended the run, and it was not resumed since."""
         return (self.path / FAILED).is_file()
-
-    @property
-    def was_pruned(self) -> bool:
-        """Whether a search ended the run early."""
-        return self.is_finished and bool(self.facts().get("pruned"))
 
     def facts(self) -> dict[str, Any]:
         """Facts recorded by a finished run.
@@ -126,14 +120,11 @@ class RunDirectory:
         ``overwrite`` removes the files of an earlier run.
 
         Raises:
-            RunError: the run is finished (unless it was cut short: then it gets the same epochs and minutes once more),
-                was started with another configuration, or has no intact checkpoint.
+            RunError: the run is finished, was started with another configuration, or has no intact checkpoint.
         """
         remove_leftovers(self.path)
         if overwrite:
             self._clear()
-        if self.is_finished and self._was_cut_short(config):
-            self._go_on()
         if self.is_finished:
             raise RunError(
                 f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
@@ -147,26 +138,6 @@ class RunDirectory:
         self.record("resumed" if resume else "started")
         self._prepared = True
         return resume
-
-    @property
-    def allowances(self) -> int:
-        """Number of grants of the configured epochs and minutes: one, and one more each time the run was cut short."""
-        path = self.path / EVENTS
-        granted = json.dumps({"event": GRANTED})[1:-1]  # compared as text: a kill may have truncated the last line
-        return 1 + (path.read_text().count(granted) if path.is_file() else 0)
-
-    def _was_cut_short(self, config: Mapping[str, Any]) -> bool:
-        """Whether a run of equal configuration was stopped here before convergence and can continue."""
-        if not (self.path / BEFORE_THE_END).is_file() or changed_keys(self.config(), config):
-            return False
-        return bool(dict(self.facts().get("learning") or {}).get("cut_short"))
-
-    def _go_on(self) -> None:
-        read_checkpoint(self.path / BEFORE_THE_END)
-        self.record(GRANTED)
-        (self.path / PREVIOUS_CHECKPOINT).unlink(missing_ok=True)
-        os.replace(self.path / BEFORE_THE_END, self.checkpoint)
-        (self.path / FINISHED).unlink()
 
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
         """Compares the configuration of this run with another one.
@@ -236,7 +207,7 @@ class RunDirectory:
         finished, measured = self.path / FINISHED, self.path / EVALUATION
         if dict(config.get("protocol") or {}).get("part") == "test":
             measured = self.path / TEST
-        if not self.is_finished or self.was_pruned or changed_keys(self.config(), config):
+        if not self.is_finished or changed_keys(self.config(), config):
             return False
         return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
 

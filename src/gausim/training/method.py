@@ -27,8 +27,7 @@ from gausim.training.terms.term import Term
 class Moment:
     """Position of an optimiser step in a run: after ``epoch`` of ``epochs`` and ``batch`` of ``batches`` in the epoch.
 
-    The fraction done is at least ``least``, the part of the time budget that is used, and at most ``most``, while the
-    final part of the run has not begun.
+    The fraction done is at least ``least``, the part of the time budget that is used.
     """
 
     epoch: int
@@ -36,13 +35,12 @@ class Moment:
     batches: float
     epochs: int
     least: float = 0.0
-    most: float = 1.0
 
     @property
     def done(self) -> float:
         """Epochs done, for schedules of learning rates."""
         done = self.epoch + self.batch / max(1.0, self.batches)
-        return min(max(done, self.least * self.epochs), self.most * self.epochs)
+        return max(done, self.least * self.epochs)
 
 
 @dataclass(frozen=True)

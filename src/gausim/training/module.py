@@ -46,7 +46,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         self.seed, self.fraction_every, self.measuring = seed, fraction_every, bool(fraction_every)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
-        self.time_fraction, self.progress_limit = 0.0, 1.0
+        self.time_fraction = 0.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self.cost = not self.method.warns, TrainingCost()
 
@@ -71,7 +71,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         """Predicts and renders the batch, and makes one optimiser step."""
         optimizer, trainer = cast(Any, self.optimizers()), self.trainer
         batches, epochs = float(trainer.num_training_batches), trainer.max_epochs or 1
-        now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction, self.progress_limit)
+        now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction)
         task = self.method.begin_step(optimizer.optimizer, self.settings, now)
         if task.is_new:
             self.baselines = Baselines(self.supervision)
@@ -102,10 +102,6 @@ class GausSimModule(OptimiserStep, LightningModule):
         if every and self.global_step % every == 0:
             for logger in self.trainer.loggers:
                 logger.log_metrics({f"train/{k}": v for k, v in stats.items()}, step=self.global_step)
-
-    def note(self, name: str, value: float) -> None:
-        """Adds a value to a mean of the current epoch."""
-        self._sums[name] = [value, 1.0]
 
     def epoch_means(self) -> dict[str, float]:
         """Means over the sequences of the epoch so far."""

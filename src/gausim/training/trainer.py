@@ -14,7 +14,6 @@ from lightning.pytorch.loggers import Logger
 from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
 from gausim.runs.cost import keep_freed_memory
-from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.resume import ExactResume
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.ranks.launch import Crew
@@ -32,7 +31,6 @@ class TrainerSettings(Layout):
     clock: str = "wall"
     log_every_n_steps: int = 20
     progress: bool = True
-    convergence: Convergence | None = None
 
 
 def make_trainer(
@@ -59,9 +57,7 @@ def make_trainer(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
-    # Convergence precedes callbacks that report its result.
-    own: list[Callback] = [] if settings.convergence is None else [settings.convergence]
-    own += [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
+    own: list[Callback] = [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
     if settings.max_minutes is not None:
         own.append(TimeBudget(minutes=settings.max_minutes, clock=settings.clock))
     return Trainer(

@@ -21,14 +21,14 @@ from gausim.runs.directory import RunDirectory, one_line
 log = logging.getLogger(__name__)
 
 # Outcomes of a job.
-TRAINED, PRUNED, FINISHED_BEFORE, BUSY = "trained", "pruned", "finished before", "trained by another process"
+TRAINED, FINISHED_BEFORE, BUSY = "trained", "finished before", "trained by another process"
 FAILED, FAILED_BEFORE = "failed", "failed before"
-# The metric that searches minimise: the last epoch's loss above the floor, over that of the static prediction.
+# The metric that a search may minimise: the last epoch's loss above the floor, over that of the static prediction.
 OBJECTIVE = "excess_static"
 
 
 class JobResult(float):
-    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job."""
+    """The objective of a job as a float (nan if it has none), with the outcome of the job."""
 
     state: str  # one of the constants of this module
     directory: str  # the run directory
@@ -84,7 +84,7 @@ def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
 
 def _finished(run: RunDirectory, state: str) -> JobResult:
     facts = run.facts()
-    return JobResult.of(facts["last_epoch"].get(OBJECTIVE), PRUNED if facts.get("pruned") else state, run)
+    return JobResult.of(facts["last_epoch"].get(OBJECTIVE), state, run)
 
 
 @contextmanager
@@ -117,7 +117,7 @@ def conclude(folder: Path, results: Sequence[JobResult]) -> None:
         RunError: a job failed, now or before.
     """
     counts = Counter(result.state for result in results)
-    parts = [f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s]]
+    parts = [f"{counts[s]} {s}" for s in (TRAINED, FINISHED_BEFORE, BUSY) if counts[s]]
     failed = {r.directory: r for r in results if r.state in (FAILED, FAILED_BEFORE)}
     parts += [f"{len(failed)} failed"] if failed else []
     shown = ", ".join(parts) or "nothing left to do"

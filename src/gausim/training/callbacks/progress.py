@@ -15,7 +15,6 @@ from lightning.pytorch.callbacks import RichProgressBar
 
 from gausim.runs.names import EPOCHS
 from gausim.training.callbacks.cadence import training_data
-from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.module import GausSimModule
 from gausim.training.table import Table, short
@@ -28,7 +27,7 @@ class EpochSummary(Callback):
     """One line per epoch on the console and one row per epoch in ``epochs.csv`` of the run."""
 
     COLUMNS = (
-        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first",
+        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "ratio_first",
         "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network",
         "grad_scene", "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
@@ -76,7 +75,7 @@ class EpochSummary(Callback):
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
             "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
-            "held_back": "held back {:.3f}", "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
+            "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
             "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
@@ -87,9 +86,8 @@ class EpochSummary(Callback):
         module = cast(GausSimModule, trainer.lightning_module)
         # Epochs of a fit's stages differ in length.
         left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
-        judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
         if left is not None:
-            parts.append(f"{'at most' if judged else 'about'} {left:.0f} min left")
+            parts.append(f"about {left:.0f} min left")
         return "  ".join(parts)
 
     def _table(self, trainer: Trainer) -> Table:

@@ -6,26 +6,21 @@ import signal
 import threading
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from gausim.core import ConfigError
-from gausim.runs.checkpoint import BEFORE_THE_END, LAST_CHECKPOINT, digest
+from gausim.runs.checkpoint import LAST_CHECKPOINT, digest
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.callbacks.cadence import has_come
-from gausim.training.callbacks.convergence import Convergence
 from gausim.training.loggers.files import Resumable
 from gausim.training.ranks.ranks import Ranks
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves ``last.ckpt`` periodically, also within epochs, and numbered snapshots on request.
-
-    If the final part of a run begins before convergence, ``before_the_end.ckpt`` is saved, from which a run with more
-    time continues.
-    """
+    """Saves ``last.ckpt`` periodically, also within epochs, and numbered snapshots on request."""
 
     def __init__(
         self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
@@ -56,8 +51,6 @@ class RunCheckpoint(Checkpoint):
         if has_come(trainer, self._every) or self._due(trainer):
             self._save(trainer)
         epoch = trainer.current_epoch + 1
-        if any(isinstance(c, Convergence) and c.began_to_end(trainer) for c in cast(Any, trainer).callbacks):
-            trainer.save_checkpoint(Path(trainer.default_root_dir) / BEFORE_THE_END, weights_only=False)
         if self._snapshot_every and epoch % self._snapshot_every == 0:
             snapshots = Path(trainer.default_root_dir) / "snapshots"
             trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
