@@ -76,7 +76,7 @@ def trainings(shared: Shared) -> Iterator[Trainings]:
 @pytest.fixture(scope="session")
 def toy_run(trainings: Trainings) -> Path:
     """The directory of a finished run of three epochs on a toy of three sequences; not to be changed."""
-    return trainings.whole("whole", "trainer=cpu", "trainer.max_epochs=3")
+    return trainings.whole("whole", "trainer=cpu", "plan.epochs=3")
 
 
 @pytest.fixture(scope="session")

@@ -179,9 +179,9 @@ def test_a_comparison_is_at_strength_on_sealed_data(monkeypatch: pytest.MonkeyPa
     config = compose("train", ["experiment=tables/comparison", "method=physdreamer", "protocol=bunny_test"])
     assert config.model.method.discretisation.filling.dense == 1.0 and config.model.method.discretisation.cells == 32
     assert config.data.sequences == config.data.test.sequences == ["seq_008", "seq_009", "seq_010", "seq_011"]
-    assert config.protocol.part == "test" and config.trainer.max_minutes == 10
+    assert config.protocol.part == "test" and config.plan.max_minutes == 10
     config = compose("train", ["method=gausim_paper", "protocol=pudding_soft_test", "budget=gpu"])
-    assert config.data.repeats == 70 and config.loss.backprop_steps == 1 and config.data.names == ["pudding_soft"]
+    assert config.plan.repeats == 70 and config.loss.backprop_steps == 1 and config.data.names == ["pudding_soft"]
     assert config.data.test.seeds == list(range(101, 121)) and str(config.data.root).endswith("synthetic_test")
 
 
@@ -195,7 +195,7 @@ def leaves(node: Any) -> list[Any]:
 @pytest.mark.parametrize(
     "swept",
     [
-        ["trainer.max_minutes=1,2", "ablation=none,no_mass"],
+        ["plan.max_minutes=1,2", "ablation=none,no_mass"],
         ["data.root=a/b,a/../b,a_b"],
         ["experiment=bunny,bunny_paper", "name=rose"],
     ],

@@ -27,7 +27,7 @@ def joint(toy: Path, other: Path, shared: Shared) -> Path:
     """A run of both objects, the second pinned by its own selection; not to be changed."""
 
     def train(run: Path) -> None:
-        asked = ["data=joint", joint_runs.both(toy, other), "data.batch_size=3", f"hydra.run.dir={run}"]
+        asked = ["data=joint", joint_runs.both(toy, other), "plan.batch_size=3", f"hydra.run.dir={run}"]
         assert command.main([*joint_runs.TINY, *asked, "optimizer.ema_decay=0.5"]) == 0
 
     return shared("joint", train)

@@ -38,7 +38,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pu
     assert len(states) == 2 and all(bool(value.any()) for value in states)
     run = load_run(out)
     assert [r.name for r in run.objects[0].sequences] == ["hard", "other_way"]
-    assert run.config["data"]["curriculum"]["t_max"] == 3 and run.config["name"].endswith("_adapted_4")
+    assert run.config["plan"]["t_max"] == 3 and run.config["name"].endswith("_adapted_4")
     ratios = [float(row["ratio_static"]) for row in rows(out / "epochs.csv")]
     assert ratios[-1] < 0.9 * ratios[0]
     told = json.loads((out / "evaluation" / "metrics.json").read_text())["objects"]["toy"]["rows"]

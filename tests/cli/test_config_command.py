@@ -79,16 +79,16 @@ def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsy
 
 def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
     wrong = ["sed=1", "model.simulator.template.peroid=1", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
-    assert main(["config", "validate", *wrong, "model=gausim", "trainer.max_minutes=soon"]) == 1
+    assert main(["config", "validate", *wrong, "model=gausim", "plan.max_minutes=soon"]) == 1
     told = capsys.readouterr()
     for expected in (
         "sed: unknown key. Did you mean 'seed'?",
         # Which only this model has.
         "model.simulator.template.peroid: unknown key. Did you mean 'model.simulator.template.period'?",
-        "trainer.max_epoch: unknown key. Did you mean 'trainer.max_epochs'?",
+        "trainer.max_epoch: unknown key. Did you mean 'plan.epochs'?",
         "Available options in 'render': auto cpu gsplat reference",
         "seed=x: Value 'x' of type 'str' could not be converted to Integer",
-        "trainer.max_minutes: expected a number or null, got 'soon'.",
+        "plan.max_minutes: expected a number or null, got 'soon'.",
     ):
         assert expected in told.out
     assert told.err == "6 faults\n"
@@ -114,7 +114,7 @@ def test_a_saved_configuration(once, tmp_path, capsys) -> None:
     saved.write_text(yaml.safe_dump(config))
     assert main(["config", "validate", str(saved.parent)]) == 0
     config["optimiser"] = config.pop("optimizer")
-    config["data"]["curriculum"] |= {"tmax": 3, "t_start": None}
+    config["plan"] |= {"tmax": 3, "repeats": None}
     config["model"]["simulator"]["template"]["mode"] = 3
     config["model"]["simulator"]["hierarchy"]["levels"] = [{"diameter": "wide", "edge_length": 1.0}]
     config["sweep"]["retry"] = True
@@ -125,14 +125,14 @@ def test_a_saved_configuration(once, tmp_path, capsys) -> None:
     told = capsys.readouterr().out.splitlines()
     assert told == [
         "optimizer: missing. Every configuration that is trained has it.",
-        "data.curriculum.t_start: expected a whole number, got null.",
-        "data.curriculum.tmax: unknown key of gausim.data.curriculum.Curriculum. Did you mean 't_max'?",
+        "plan.t_start: expected a whole number, got null.",
+        "plan.tmax: unknown key of gausim.plan.Curriculum. Did you mean 't_max'?",
         "model.simulator.hierarchy.levels.0.diameter: expected a number, got 'wide'.",
         "model.simulator.template.mode: unknown key of gausim.models.template.elastic.ElasticTemplate. "
         "Did you mean 'modes'?",
         "optimiser: unknown key. Did you mean 'optimizer'?",
         "sweep.retry: unknown key. Known: retry_failed.",
-        "trainer.max_epochs: expected a whole number, got 'ten'.",
+        "plan.epochs: expected a whole number, got 'ten'.",
     ]
 
 
@@ -191,7 +191,6 @@ def test_what_is_no_configuration(what: list[str], message: str, tmp_path, monke
         ("train hydra/swee", {"hydra/sweeper="}),
         ("train sed=1 model.simu", set()),  # beside what is wrong nothing composes
         ("config validate experiment=demo_", {"experiment=demo_tiny"}),
-        ("adapt RUN --set trainer.max_e", {"trainer.max_epochs="}),
     ],
 )  # fmt: skip
 def test_what_may_follow(line: str, expected: set[str]) -> None:

@@ -105,7 +105,7 @@ def test_a_fetched_run_names_what_it_misses_and_works_with_it(
     for name in ("scene.ply", "scene.masks.npz"):
         (toy / name).rename(tmp_path / "apart" / name)
     asked = [f"data.root={toy}", f"data.scene={tmp_path}/apart/scene.ply", "hydra.run.dir=made", "name=made"]
-    assert command.main([*PAPER, *asked, "trainer.max_epochs=1"]) == 0
+    assert command.main([*PAPER, *asked, "plan.epochs=1"]) == 0
     assert pack.main(["made"]) == 0
     assert fetch.main(["made.zip", "--sha256", re.findall("--sha256 (.*)", capsys.readouterr().out)[0]]) == 0
     for name in ("toy", "apart"):

@@ -18,7 +18,7 @@ from gausim.core import ConfigError
 from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
-    "data.curriculum.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
+    "plan.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
     "render=reference", "callbacks.panels.every_epochs=0", "name=toy", "doctor=false",
 )  # fmt: skip
 STAGES = "model.plan.stages"
@@ -138,7 +138,7 @@ def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
     clock = iter(float(i) for i in range(10_000))  # every look at the clock takes a second
     monkeypatch.setattr("time.process_time", lambda: next(clock))
     long = [f"{STAGES}.velocity.iterations=40", f"{STAGES}.dynamics.iterations=40"]
-    budget = ["trainer.max_minutes=0.3", "trainer.clock=cpu"]
+    budget = ["plan.max_minutes=0.3", "plan.clock=cpu"]
     train.main(["model=spring_mass", *SMALL["spring_mass"], *long, *budget, *arguments])
     notes = load_run(Path("outputs/toy/seed_0")).module.notes()  # type: ignore[operator]
     cut = [note for note in notes if " had " in note and "iterations per sequence" in note]

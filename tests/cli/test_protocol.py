@@ -27,7 +27,7 @@ from gausim.results.looks import read_looks
 RESERVED = "data.test={sequences: [seq_001]}"
 TINY = (
     "model=constant_velocity", "model.method.anchors=12", "model.plan.stages.velocity.iterations=2",
-    "model.plan.round=1", "data.curriculum.t_max=7", "trainer.progress=false", "trainer.threads=1", "render=reference",
+    "model.plan.round=1", "plan.t_max=7", "trainer.progress=false", "trainer.threads=1", "render=reference",
     "callbacks.panels.every_epochs=1", "callbacks.motion.every_epochs=1", "logger=none", "name=toy", RESERVED,
 )  # fmt: skip
 

@@ -141,8 +141,8 @@ def test_parts_and_directions(played) -> None:
 
 
 TINY = (
-    LEVELS, "model.simulator.template.modes=8", "model.simulator.network.hidden=8", "data.curriculum.t_max=3",
-    "data.repeats=1", "data.batch_size=2", "trainer.max_epochs=4", "trainer.accelerator=cpu", "trainer.progress=false",
+    LEVELS, "model.simulator.template.modes=8", "model.simulator.network.hidden=8", "plan.t_max=3",
+    "plan.repeats=1", "plan.batch_size=2", "plan.epochs=4", "trainer.accelerator=cpu", "trainer.progress=false",
     "trainer.threads=1", "render=reference", "callbacks.panels=null", "logger=none", "name=toy",
 )  # fmt: skip
 

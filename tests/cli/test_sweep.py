@@ -48,7 +48,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
     with sole_writer(second / ".lock"):
         status, output = do("cut", "seed=0,1")
     assert status == 2 and f"left out, {second}: another process" in output, output
-    assert "1 trained by another process, 1 failed" in output and "changed: trainer.max_epochs" in output
+    assert "1 trained by another process, 1 failed" in output and "changed: plan.epochs" in output
     assert [history(run) for run in (first, second)] == expected and steps(first) == 8
 
 
@@ -126,7 +126,7 @@ def test_jobs_side_by_side_leave_what_one_after_another_would(do: Sweeps, launch
 
 @pytest.mark.slow
 def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Sweeps) -> None:
-    swept = ("seed=0,1,2,3,4,5", "data.repeats=5", "trainer.max_epochs=6")
+    swept = ("seed=0,1,2,3,4,5", "plan.repeats=5", "plan.epochs=6")
     status, output = do("undisturbed", *swept)
     assert status == 0, output
     # Moments are counted in calls, not in seconds: 360 steps in all, saved once to seven times an epoch.

@@ -100,6 +100,6 @@ def test_a_panel_that_cannot_be_drawn_is_left_out(
         return torch.full((3, 1, 32, 32, 3), torch.nan)
 
     monkeypatch.setattr(GausSimModule, "predict_images", explode)
-    assert command.main([*arguments, SHOWN, "logger=none", "trainer.max_epochs=1"]) == 0
+    assert command.main([*arguments, SHOWN, "logger=none", "plan.epochs=1"]) == 0
     assert "no panel of toy at step 1: the predicted images are not finite" in capsys.readouterr().out
     assert list(Path("outputs/toy/seed_0/panels").glob("step_*")) == []

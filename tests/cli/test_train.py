@@ -38,7 +38,7 @@ def finished(toy: Path, shared: Shared) -> Path:
     """A run of one epoch, which tests copy."""
 
     def train(root: Path) -> None:
-        assert command.main([f"data.root={toy}", *PAPER, "trainer.max_epochs=1", f"paths.output_root={root}"]) == 0
+        assert command.main([f"data.root={toy}", *PAPER, "plan.epochs=1", f"paths.output_root={root}"]) == 0
 
     return shared("finished", train)
 
@@ -47,7 +47,7 @@ def finished(toy: Path, shared: Shared) -> Path:
 def again(arguments: list[str], finished: Path, tmp_path: Path) -> list[str]:
     """The arguments of a run that is finished here already."""
     shutil.copytree(finished, tmp_path / "outputs")
-    return [*arguments, "trainer.max_epochs=1"]
+    return [*arguments, "plan.epochs=1"]
 
 
 def test_motion_and_data_are_looked_at_and_training_does_not_notice(
@@ -91,7 +91,7 @@ def test_faults_of_the_data_are_told_again_at_the_end(
     facts = json.loads((one_view / "dataset.json").read_text())
     views = facts["train_views"] + facts["heldout_views"]
     (one_view / "dataset.json").write_text(json.dumps({**facts, "train_views": views[:1], "heldout_views": views[1:]}))
-    assert command.main([*arguments, f"data.root={one_view}", "doctor=true", "trainer.max_epochs=1"]) == 0
+    assert command.main([*arguments, f"data.root={one_view}", "doctor=true", "plan.epochs=1"]) == 0
     end = capsys.readouterr().out.partition("Trained for")[2]
     assert "The data are faulty" in end and "one training view only" in end and "gausim doctor" in end
     faults = json.loads((RUN / "FINISHED").read_text())["data_faults"]
@@ -177,8 +177,8 @@ def test_the_process_that_compiles_trains_to_the_same_bits_as_one_that_loads_fro
     for run in ("first", "second"):
         command = [
             sys.executable, "-m", "gausim.cli.main", "train", f"data.root={toy}", "render=cpu", "trainer.threads=1",
-            "trainer.accelerator=cpu", "trainer.max_epochs=2", "trainer.progress=false", "data.curriculum.t_max=3",
-            "data.repeats=1", "data.batch_size=2", LEVELS,
+            "trainer.accelerator=cpu", "plan.epochs=2", "trainer.progress=false", "plan.t_max=3",
+            "plan.repeats=1", "plan.batch_size=2", LEVELS,
             "logger=none", f"hydra.run.dir={tmp_path / run}",
         ]  # fmt: skip
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)

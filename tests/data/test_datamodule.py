@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import lightning as L
 import pytest
@@ -9,11 +10,11 @@ import torch
 from helpers.blob import make_object
 
 from gausim.core import ConfigError, DataError
-from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceIndex
 from gausim.data.objects import ObjectData
 from gausim.data.sampler import SequenceBatchSampler
+from gausim.training.plan import TrainingPlan
 from gausim.training.ranks.ranks import interleave
 
 
@@ -25,43 +26,19 @@ def two_objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def sampler(**options: int) -> SequenceBatchSampler:
-    settings = {"batch_size": 2, "repeats": 3, "seed": 4, "curriculum": Curriculum(), **options}
-    return SequenceBatchSampler(5, **settings)
+def plan(**options: Any) -> TrainingPlan:
+    return TrainingPlan(**{"repeats": 1, "batch_size": 2, "t_start": 1, "t_max": 15, **options})
 
 
-def test_curriculum_grows_to_its_cap() -> None:
-    grown = [Curriculum().steps(e) for e in (0, 1, 5, 13, 14, 15, 90)]
-    assert grown == [1, 2, 6, 14, 15, 15, 15]
-    assert [Curriculum(t_start=3, t_max=5, epochs_per_increase=2).steps(e) for e in range(8)] == [
-        *(3, 3, 4, 4),
-        *(5, 5, 5, 5),
-    ]
-    for wrong in ({"t_start": 0}, {"t_start": 16}, {"epochs_per_increase": 0}):
-        with pytest.raises(ConfigError, match="curriculum"):
-            Curriculum(**wrong)
+def sampler(batch_size: int = 2, **options: int) -> SequenceBatchSampler:
+    return SequenceBatchSampler(5, plan=plan(repeats=3, batch_size=batch_size), **{"seed": 4, **options})
 
 
-@pytest.mark.parametrize(
-    ("frames", "largest", "first"), [(3, 2, [2, 2]), (16, 15, [2, 3, 4]), (42, 41, [2, 5, 8]), (200, 60, [2, 7])]
-)
-def test_a_curriculum_without_a_cap_follows_the_seen_frames(frames: int, largest: int, first: list[int]) -> None:
-    curriculum = Curriculum(t_start=2, t_max=0)
-    curriculum.see(frames)
-    assert (
-        curriculum.t_max == largest == curriculum.steps(13)
-        and [curriculum.steps(e) for e in range(len(first))] == first
-    )
-    curriculum.see(5)
-    assert curriculum.t_max == largest
-
-
-def test_the_curriculum_of_a_data_set_follows_its_seen_frames(blob: Path) -> None:
-    data = ReadyDataModule(blob, curriculum=Curriculum(t_max=0))
-    data.setup("fit")
-    assert data.curriculum.t_max == 15 and len(data.introduction()) == len(data.objects)
-    fewer = ReadyDataModule(blob, curriculum=Curriculum(t_max=9))
-    assert "frames 10..15 are seen, but not trained on (data.curriculum.t_max=9)" in fewer.introduction()[1]
+def test_frames_that_are_seen_and_not_trained_on_are_named(blob: Path) -> None:
+    data = ReadyDataModule(blob, plan=plan(t_max=15))
+    assert len(data.introduction()) == len(data.objects)
+    fewer = ReadyDataModule(blob, plan=plan(t_max=9))
+    assert "frames 10..15 are seen, but not trained on (plan.t_max=9)" in fewer.introduction()[1]
 
 
 def test_training_cannot_hand_out_unseen_frames_and_heldout_views(blob: Path) -> None:
@@ -76,7 +53,7 @@ def test_training_cannot_hand_out_unseen_frames_and_heldout_views(blob: Path) ->
 
 
 def test_what_a_loader_fetched_ahead_is_not_counted_as_trained(blob: Path) -> None:
-    data = ReadyDataModule(blob, repeats=2)
+    data = ReadyDataModule(blob, plan=plan(repeats=2, batch_size=1))
     data.setup("fit")
     ahead = iter(data.train_dataloader())
     seen = [next(ahead)[0].sequence_id for _ in range(4)]
@@ -85,15 +62,9 @@ def test_what_a_loader_fetched_ahead_is_not_counted_as_trained(blob: Path) -> No
     data.trainer = SimpleNamespace(fit_loop=loops, global_rank=0, world_size=1)  # type: ignore[assignment]
     state = data.state_dict()
     assert state == {"epoch": 0, "position": 2}
-    resumed = ReadyDataModule(blob, repeats=2)
+    resumed = ReadyDataModule(blob, plan=plan(repeats=2, batch_size=1))
     resumed.load_state_dict(state)
     assert [batch[0].sequence_id for batch in resumed.train_dataloader()][:2] == seen[2:]
-
-
-def test_curriculum_beyond_the_training_frames_is_refused(blob: Path) -> None:
-    data = ReadyDataModule(blob, curriculum=Curriculum(t_max=16))
-    with pytest.raises(ConfigError, match=r"16 steps would see frame 16, .*at most 15"):
-        data.setup("fit")
 
 
 def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -> None:
@@ -104,7 +75,7 @@ def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -
         assert len(batches) == len(one) == 8
         assert sorted(k.sequence for b in batches for k in b) == sorted(list(range(5)) * 3)
         assert all(len({k.sequence for k in b}) == len(b) for b in batches)
-        assert {k.steps for b in batches for k in b} == {Curriculum().steps(epoch)}
+        assert {k.steps for b in batches for k in b} == {plan().steps(epoch)}
 
 
 @pytest.mark.parametrize("done", [0, 3, 8])
@@ -136,12 +107,12 @@ def test_ranks_divide_the_batches_of_one_rank(world: int) -> None:
 
 
 def test_fewer_sequences_per_step_than_ranks_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"data.batch_size: .* each of the 3 ranks, got 2 .*data.batch_size=3"):
+    with pytest.raises(ConfigError, match=r"plan.batch_size: .* each of the 3 ranks, got 2 .*plan.batch_size=3"):
         sampler(batch_size=2, rank=0, world_size=3)
 
 
 def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> None:
-    data = ReadyDataModule(two_objects, batch_size=5, repeats=1)
+    data = ReadyDataModule(two_objects, plan=plan(batch_size=5))
     data.setup("fit")
     assert [o.name for o in data.objects] == ["apple", "pear"] and len(data.index) == 5
     (batch,) = list(data.train_dataloader())
@@ -200,7 +171,7 @@ def test_a_resumed_run_sees_what_an_uninterrupted_one_sees(two_objects: Path, tm
             max_epochs=2, default_root_dir=tmp_path, accelerator="cpu", enable_model_summary=False, **quiet
         )
         recorder = Recorder(stop)
-        data = ReadyDataModule(two_objects, batch_size=2, repeats=1)
+        data = ReadyDataModule(two_objects, plan=plan())
         trainer.fit(recorder, data, ckpt_path=checkpoint, weights_only=True)
         return recorder.seen if stop is None else recorder.seen[:stop]
 

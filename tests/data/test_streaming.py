@@ -16,11 +16,11 @@ from helpers.plain import edit_json
 from data_prep.pack import pack
 from gausim.core import Cameras
 from gausim.data import frames as frames_module
-from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.data.records import SequenceRecord
 from gausim.io.packed import view_path, write_header
+from gausim.training.plan import TrainingPlan
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,9 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stream(root: Path | list[Path], **options: object) -> ReadyDataModule:
-    settings: dict = {"batch_size": 2, "repeats": 1, "curriculum": Curriculum(t_max=5), **options}
-    data = ReadyDataModule(root, **settings)
+    course: dict = {"batch_size": 2, "repeats": 1, "t_start": 1, "t_max": 5}
+    course |= {name: options.pop(name) for name in list(options) if name in course}
+    data = ReadyDataModule(root, plan=TrainingPlan(**course), **options)  # type: ignore[arg-type]
     data.setup("fit")
     return data
 
@@ -81,7 +82,7 @@ def test_memory_does_not_grow_with_the_set(tmp_path: Path) -> None:
     cameras = ring_of_cameras(views, width=side, height=side)
     for number in range(sequences):
         _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side)
-    data = stream(root, batch_size=1, curriculum=Curriculum(t_start=15))
+    data = stream(root, batch_size=1, t_start=15, t_max=15)
     batch = frames * 2 * 4 * side * side  # two training views
     tracemalloc.start()
     try:
@@ -114,7 +115,7 @@ def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(SequenceRecord, "frames", noted)
     shares = []
     for rank in range(2):
-        data = ReadyDataModule(mixed, batch_size=3, repeats=1, curriculum=Curriculum(t_max=5))
+        data = ReadyDataModule(mixed, plan=TrainingPlan(batch_size=3, repeats=1, t_start=1, t_max=5))
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2)  # type: ignore[assignment]
         data.setup("fit")
         read.clear()

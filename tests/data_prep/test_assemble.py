@@ -22,13 +22,13 @@ from helpers.plain import edit_json
 from data_prep.assemble import AssembleOptions, assemble, main
 from data_prep.dataset import main as prepare_main
 from gausim.core import Cameras, ConfigError, DataError
-from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import read_rgba, write_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
 from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
+from gausim.training.plan import TrainingPlan
 
 GREEN = np.array([0, 177, 64], np.uint8)
 RATE = Fraction(24)
@@ -283,7 +283,7 @@ def test_one_command_from_films_to_a_data_set(capture: Capture, capsys: pytest.C
             assert (found[..., :3].int() - truth[..., :3].int()).abs()[both].float().mean() < 12
             same = record.cameras_of(("cam_0", "cam_1", "cam_2"))
             assert torch.allclose(same.viewmats, capture.toy.views.viewmats, atol=1e-4)
-    module = ReadyDataModule(root=str(work / "pack"), curriculum=Curriculum(t_max=5))
+    module = ReadyDataModule(root=str(work / "pack"), plan=TrainingPlan(t_start=1, t_max=5, batch_size=1))
     module.setup("fit")
     sample = next(iter(module.train_dataloader()))
     assert sample is not None

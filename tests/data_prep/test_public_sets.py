@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from helpers import public_sets
 from helpers.public_sets import FRAMES, SEEN, Sample
 
@@ -258,9 +257,6 @@ def test_a_body_that_turns_onto_itself_is_ambiguous(
 
 
 def test_the_command_that_trains_fits_the_frames() -> None:
-    """By its default, which follows the seen frames."""
-    with (Path(__file__).parents[2] / "conf" / "data" / "object.yaml").open() as file:
-        assert yaml.safe_load(file)["curriculum"]["t_max"] == 0
     assert train_command("duck", Path("out")) == "gausim train data=object data.root=out name=duck"
 
 

@@ -14,13 +14,13 @@ from helpers.plain import plain_scene
 from helpers.simulators import SMALLEST
 
 TINY = (
-    *SMALLEST, "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
+    *SMALLEST, "plan.t_start=2", "plan.t_max=2", "plan.repeats=1", "plan.epochs=2",
     "trainer.accelerator=cpu", "render=reference", "logger=none",
 )  # fmt: skip
 # One of the paper's model, without pictures and dashboards.
 PAPER = (
-    *SMALLEST, "model=gausim_paper", "data.curriculum.t_start=1", "data.curriculum.t_max=2", "data.repeats=1",
-    "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu", "render=reference", "logger=none",
+    *SMALLEST, "model=gausim_paper", "plan.t_start=1", "plan.t_max=2", "plan.repeats=1",
+    "plan.batch_size=2", "plan.epochs=2", "trainer.accelerator=cpu", "render=reference", "logger=none",
     "name=toy",
 )  # fmt: skip
 

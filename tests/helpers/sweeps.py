@@ -12,8 +12,8 @@ from helpers.toy_runs import Server
 from helpers.toy_runs import killed as dying  # noqa: F401
 
 TINY = (
-    *SMALLEST, "model=gausim_paper", "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=2",
-    "data.batch_size=1", "trainer=cpu", "trainer.max_epochs=2", "render=reference", "logger=none",
+    *SMALLEST, "model=gausim_paper", "plan.t_max=2", "plan.t_start=1", "plan.repeats=2",
+    "plan.batch_size=1", "trainer=cpu", "plan.epochs=2", "render=reference", "logger=none",
 )  # fmt: skip
 
 

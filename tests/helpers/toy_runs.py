@@ -20,9 +20,8 @@ from helpers.simulators import SMALLEST
 
 # The smallest run in which everything happens that a resumed run could get wrong.
 TINY = (
-    *SMALLEST, "model=gausim_paper", "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1",
-    "optimizer.schedule.warmup=0.5",
-    "data.batch_size=1", "render=reference", "optimizer.ema_decay=0.9", "trainer.log_every_n_steps=1",
+    *SMALLEST, "model=gausim_paper", "plan.repeats=2", "plan.t_max=3", "plan.t_start=1",
+    "plan.batch_size=1", "render=reference", "optimizer.ema_decay=0.9", "trainer.log_every_n_steps=1",
 )  # fmt: skip
 
 

@@ -176,11 +176,11 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
 
 def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs() -> None:
     start = "gausim train experiment=tables/comparison"
-    jobs = [f"{start} method={m} seed={s} ++trainer.clock=cpu paths.output_root=/x" for m in "ab" for s in (0, 1)]
-    jobs += [f"{start} method=c seed=0 ++trainer.clock=cpu paths.output_root=/x", "gausim train model=m init_from=o/r"]
+    jobs = [f"{start} method={m} seed={s} ++plan.clock=cpu paths.output_root=/x" for m in "ab" for s in (0, 1)]
+    jobs += [f"{start} method=c seed=0 ++plan.clock=cpu paths.output_root=/x", "gausim train model=m init_from=o/r"]
     assert joined(jobs) == [
-        f"gausim train -m {start[13:]} method=a,b seed=0,1 trainer.clock=cpu",
-        f"gausim train {start[13:]} method=c seed=0 trainer.clock=cpu",
+        f"gausim train -m {start[13:]} method=a,b seed=0,1 plan.clock=cpu",
+        f"gausim train {start[13:]} method=c seed=0 plan.clock=cpu",
         "gausim train model=m init_from=o/r",
     ]
     assert joined(

@@ -30,7 +30,7 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
 
 def test_changed_keys_are_named_and_free_ones_are_not(tmp_path: Path) -> None:
     changed = {**CONFIG, "seed": 1, "paths": {"output_root": "p"}, "trainer": {"max_epochs": 4, "threads": 2}}
-    assert changed_keys(CONFIG, changed) == ["seed", "trainer.max_epochs"]
+    assert changed_keys(CONFIG, changed) == ["seed", "plan.epochs"]
     assert changed_keys(CONFIG, {**CONFIG, "extra": 1}) == ["extra"]
     run = RunDirectory(tmp_path)
     run.prepare(CONFIG)

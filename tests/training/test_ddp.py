@@ -115,7 +115,7 @@ def test_wrong_layouts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(ConfigError, match=r"trainer: expected devices >= 1"):
             Layout(**wrong)
     with pytest.raises(ConfigError, match=r"trainer.devices: expected 1, got 2"):
-        make_trainer(TrainerSettings(max_epochs=1, devices=2))
+        make_trainer(TrainerSettings(devices=2), epochs=1)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     slurm = {"SLURM_NTASKS": "3", "SLURM_NTASKS_PER_NODE": "3", "SLURM_JOB_NAME": "train"}
     for environment, layout, words in (

@@ -16,20 +16,20 @@ from helpers.toy_runs import Trainings, assert_same_run, killed, rows
 
 from gausim.runs.checkpoint import digest, read_checkpoint
 
-TWO = ("trainer=ddp", "trainer.accelerator=cpu", "data.batch_size=2", "trainer.timeout_minutes=2")
+TWO = ("trainer=ddp", "trainer.accelerator=cpu", "plan.batch_size=2", "trainer.timeout_minutes=2")
 STEP = "gausim.training.module.GausSimModule.training_step"
 
 
 @pytest.fixture(scope="module")
 def whole(trainings: Trainings) -> Path:
-    return trainings.whole("two_ranks", *TWO, "trainer.max_epochs=3")
+    return trainings.whole("two_ranks", *TWO, "plan.epochs=3")
 
 
 @pytest.mark.slow
 def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_the_same_bits(
     trainings: Trainings, whole: Path
 ) -> None:
-    settings = (*TWO, "trainer.max_epochs=3", "callbacks.checkpoint.every_steps=2")
+    settings = (*TWO, "plan.epochs=3", "callbacks.checkpoint.every_steps=2")
     began = time.monotonic()
     status, output = trainings("rank_cut", *settings, **killed(STEP, 6, rank=1))
     assert status == 2, output
@@ -45,10 +45,10 @@ def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_th
 
 
 def test_two_ranks_learn_what_one_does(trainings: Trainings) -> None:
-    status, output = trainings("both", *TWO, "trainer.max_epochs=1")
+    status, output = trainings("both", *TWO, "plan.epochs=1")
     assert status == 0 and "training on cpu (2 ranks, 1 torch thread)" in output, output
     assert output.count("epoch 1/1") == 1
-    status, output = trainings("alone", "trainer=cpu", "data.batch_size=2", "trainer.max_epochs=1")
+    status, output = trainings("alone", "trainer=cpu", "plan.batch_size=2", "plan.epochs=1")
     assert status == 0, output
     found, alone = (rows(trainings.run(name) / "epochs.csv") for name in ("both", "alone"))
     for row, expected in zip(found, alone, strict=True):
@@ -59,7 +59,7 @@ def test_two_ranks_learn_what_one_does(trainings: Trainings) -> None:
 
 @pytest.mark.slow
 def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(trainings: Trainings) -> None:
-    settings, name = (*TWO, "trainer.max_epochs=2"), "swept"
+    settings, name = (*TWO, "plan.epochs=2"), "swept"
     status, output = trainings(name, *settings, "optimizer.network_lr=0.001,0.002", "-m")
     assert status == 0, output
     assert output.count("(2 ranks, ") == 2 and "sweep of 2 jobs: 2 trained" in output and "Traceback" not in output

@@ -34,8 +34,8 @@ from gausim.training.rollout import States
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
     "model.simulator.template.solid.spacing=0.2", "model.simulator.network.hidden=8",
-    "model.simulator.network.layers=1", "data.held_out=1", "data.batch_size=2",
-    "data.curriculum.t_start=2", "data.curriculum.t_max=4", "logger=none",
+    "model.simulator.network.layers=1", "data.held_out=1", "plan.batch_size=2",
+    "plan.t_start=2", "plan.t_max=4", "logger=none",
 )  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def test_the_known_material_gives_the_body_its_lowest_period(corpus: Path) -> No
         assert 2 * math.pi / math.sqrt(lowest) == pytest.approx(item.body.record.period, rel=1e-3)
 
 
-COMMON = ("trainer.max_epochs=2", "trainer.progress=false", *SMALL)
+COMMON = ("plan.epochs=2", "trainer.progress=false", *SMALL)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from gausim.runs.checkpoint import read_checkpoint
 
 SAVED = "gausim.runs.checkpoint._check_written"
 STEP = "gausim.training.module.GausSimModule.training_step"
-THREE = ("trainer=cpu", "trainer.max_epochs=3")
+THREE = ("trainer=cpu", "plan.epochs=3")
 
 
 def step_of(run: Path, name: str = "last.ckpt") -> int:
@@ -95,7 +95,7 @@ def test_a_run_created_again_from_its_saved_config_is_equal(trainings: Trainings
 
 @pytest.mark.slow
 def test_a_run_whose_time_was_up_is_not_trained_further(trainings: Trainings) -> None:
-    short = ("trainer=cpu", "trainer.max_minutes=0.001", "trainer.clock=cpu", "trainer.max_epochs=400")
+    short = ("trainer=cpu", "plan.max_minutes=0.001", "plan.clock=cpu", "plan.epochs=400")
     assert trainings("short", *short, **killed("gausim.runs.directory.RunDirectory.finish", 1))[0] == -9
     run = trainings.run("short")
     before = learned(run)
@@ -115,7 +115,7 @@ def test_a_directory_that_cannot_be_written_is_named(trainings: Trainings) -> No
 
 @pytest.mark.slow
 def test_twenty_kills_at_random_moments(trainings: Trainings) -> None:
-    settings = ("trainer=cpu", "trainer.max_epochs=100", "render=cpu", "data.repeats=4")
+    settings = ("trainer=cpu", "plan.epochs=100", "render=cpu", "plan.repeats=4")
     undisturbed = trainings.whole("undisturbed", *settings)
     moments, kills, steps, seen, patience = random.Random(0), 0, set(), 0, 0.6
     run, status, output = trainings.run("disturbed"), -9, ""

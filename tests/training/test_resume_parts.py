@@ -16,9 +16,7 @@ from lightning.pytorch import LightningModule, Trainer
 from gausim.runs.cost import TrainingCost
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.callbacks.resume import RunCheckpoint
-from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
-from gausim.training.module import GausSimModule
 
 MODULE = LightningModule()
 
@@ -95,28 +93,19 @@ def test_saves_come_by_steps_and_by_minutes_within_an_epoch(monkeypatch: pytest.
     assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [-1, 6, -1, 11]  # its end saves that
 
 
-def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_run_goes_on_with_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    module = object.__new__(GausSimModule)
-    torch.nn.Module.__init__(module)
-    module.time_fraction = 0.0
-
-    def step(budget: TimeBudget, trainer: Trainer) -> float:
-        now[0] += 15.0
-        budget.on_train_batch_end(trainer, module, None, None, 0)
-        return module.time_fraction
-
-    whole, trainer = TimeBudget(minutes=1), trainer_at(0)
-    whole.on_train_start(trainer, module)
-    assert [step(whole, trainer) for _ in range(2)] == [0.25, 0.5]
-    state, module.time_fraction = whole.state_dict(), 0.0
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    cost = TrainingCost()
+    now[0] += 30.0
+    assert cost.minutes("wall") == 0.5
+    state = cost.state_dict()
     now[0] += 500.0  # nobody trains
-    resumed = TimeBudget(minutes=1)
+    resumed = TrainingCost()
     resumed.load_state_dict(state)
-    resumed.on_train_start(trainer, module)
-    assert module.time_fraction == 0.5  # what the next step's learning rate follows
-    assert [step(resumed, trainer) for _ in range(2)] == [0.75, 1.0] and trainer.should_stop
+    assert resumed.minutes("wall") == 0.5
+    now[0] += 15.0
+    assert resumed.minutes("wall") == 0.75
 
 
 def test_cost_goes_on_where_a_checkpoint_ended() -> None:

@@ -16,10 +16,12 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.losses import ImageLoss, Objective
 from gausim.models.initial_state import ModalInitialStates
+from gausim.nn.schedules import CosineSchedule
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
-from gausim.training.optimizers import HalvingSchedule, OptimizerSettings, StableDecaySchedule
+from gausim.training.optimizers import OptimizerSettings
+from gausim.training.plan import TrainingPlan
 from gausim.training.trainer import TrainerSettings, make_trainer
 
 SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
@@ -34,10 +36,10 @@ def fit(
     after: Callable[[], None] = lambda: None,
 ) -> None:
     """Trains; ``after`` is called after every step."""
-    settings = TrainerSettings(max_epochs=epochs, accelerator="cpu", progress=False, log_every_n_steps=1)
+    settings = TrainerSettings(accelerator="cpu", progress=False, log_every_n_steps=1)
     seen = LambdaCallback(on_train_batch_end=lambda *_: after())
     loader = torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda x: x)  # type: ignore[arg-type]
-    make_trainer(settings, run_dir=tmp_path, callbacks=[seen]).fit(module, loader)
+    make_trainer(settings, epochs=epochs, run_dir=tmp_path, callbacks=[seen]).fit(module, loader)
 
 
 def snapshot(module: GausSimModule) -> dict[str, Tensor]:
@@ -122,27 +124,6 @@ def test_a_collapse_is_warned_of_once(tmp_path: Path, monkeypatch: pytest.Monkey
     assert sum("collapsed" in str(w.message) for w in caught) == 1
 
 
-def test_schedules() -> None:
-    halving = HalvingSchedule(first=16, every=2)
-    assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]
-    stable = StableDecaySchedule(warmup=2.0, decay=0.25, final=0.1)
-    assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
-    assert stable.factor(75, 80) < 0.5  # an end that comes earlier brings the fall forward
-
-
-def test_shared_weights_wait_for_their_part_of_the_run() -> None:
-    settings = OptimizerSettings(network_lr=0.1, scene_lr=0.2, template_lr=0.3, shared_from=0.5)
-    groups = {name: [nn.Parameter(torch.zeros(1))] for name in ("network", "scene", "template")}
-    optimizer = settings.build(groups)
-    found = []
-    for epoch, shared in ((9.9, ("network", "template")), (9.9, ("network",)), (10.0, ("network", "template"))):
-        settings.set_rates(optimizer, epoch, 20, shared)
-        found.append([group["lr"] for group in optimizer.param_groups])
-    assert found == [[0.0, 0.2, 0.0], [0.0, 0.2, 0.3], [0.1, 0.2, 0.3]]
-    with pytest.raises(ConfigError, match="shared_from in"):
-        OptimizerSettings(shared_from=1.0)
-
-
 def test_clipping_by_group_and_altogether() -> None:
     for per_group, expected in ((True, (1.0, 1.0)), (False, (0.6, 0.8))):
         a, b = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(2))
@@ -194,11 +175,10 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
 
 @pytest.mark.slow
 def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
-    settings = OptimizerSettings(
-        network_lr=3e-3, initial_lr=3e-3, clip_per_group=True, schedule=StableDecaySchedule(warmup=0.02, decay=1)
-    )
+    settings = OptimizerSettings(network_lr=3e-3, initial_lr=3e-3, clip_per_group=True)
     parts = {"objective": Objective(backprop_steps=0, static_weight=0.0), "optimizer": settings}
     module = real_module(hidden=16, layers=2, output_scale=0.05, rest_inputs=True, parts=parts)
+    module.plan = TrainingPlan(epochs=1, schedule=CosineSchedule(warmup=0.02))
     losses: list[float] = []
     batches = [[sample(0, steps=5)]] * 300
     fit(module, batches, tmp_path, after=lambda: losses.append(module.last_stats["loss_image"]))

@@ -80,9 +80,15 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "selections": None,
         "test": None,
         "sequences": arguments.sequences,
+    }
+    plan = config["plan"] | {
         "repeats": REPEATS,
-        "batch_size": min(4, count) if count else config["data"].get("batch_size", 1),
-        "curriculum": {"_target_": "gausim.data.curriculum.Curriculum", "t_start": steps, "t_max": steps},
+        "batch_size": min(4, count) if count else config["plan"]["batch_size"],
+        "t_start": steps,
+        "t_max": steps,
+        "epochs": arguments.epochs,
+        "max_minutes": None,
+        "warm_start": None,
     }
     adapted = config | {
         "data": data,
@@ -90,7 +96,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "init_from": str(run.resolve()),
         "freeze": "model",
         "evaluate": True,
-        "trainer": config["trainer"] | {"max_epochs": arguments.epochs, "max_minutes": None},
+        "plan": plan,
         "overwrite": False,
     }
     if arguments.supervision is not None:

@@ -18,8 +18,8 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train ablation=no_momentum             without the momentum loss
   gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true     a sweep: all combinations
   gausim train -m seed=0,1,2,3 hydra/launcher=joblib                 several jobs at a time (also submitit_slurm)
-  gausim train trainer.max_minutes=30 render.threads=4
-  gausim train trainer=ddp trainer.devices=4 data.batch_size=8
+  gausim train plan.max_minutes=30 render.threads=4
+  gausim train trainer=ddp trainer.devices=4 plan.batch_size=8
   gausim train --cfg job                        print the whole configuration, run nothing
 
 A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last

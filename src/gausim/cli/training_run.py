@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli.output import end
 from gausim.cli.sweeps.jobs import do_job
-from gausim.compose.build import build, load_run
+from gausim.compose.build import build, load_run, with_resolved_plan
 from gausim.compose.config import instantiate, run_dir
 from gausim.compose.root import chosen, in_sweep
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
@@ -28,7 +28,6 @@ from gausim.models.step.simulator import GausSim
 from gausim.results.looks import DEVELOPMENT, TEST_PART
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import EPOCHS
-from gausim.training.callbacks.warm_start import WarmStart
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.fitted.fitting import StagedFit
 from gausim.training.material_scan import find_materials
@@ -67,6 +66,7 @@ def train(cfg: DictConfig) -> float | None:
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     """Trains into a run directory locked by this process, and evaluates the run if configured."""
+    cfg = with_resolved_plan(cfg)
     if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(_plain(cfg)):
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
@@ -152,11 +152,8 @@ def _fit(
 ) -> float | None:
     module, datamodule = parts
     plan = module.method.plan if isinstance(module.method, StagedFit) else None
-    trainer = _trainer(cfg, run, crew, epochs=None if plan is None else plan.epochs)
+    trainer = _trainer(cfg, run, crew, epochs=module.plan.epochs or 1)
     faults: list[str] = []
-    for callback in cast(Any, trainer).callbacks:
-        if isinstance(callback, WarmStart):
-            callback.plan(trainer, module, datamodule)
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:
@@ -202,7 +199,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
         return [f"{begin}.", *more]
     falls = {True: " and still falls", False: " and no longer falls", None: ""}[facts.get("still_falls")]
     return [
-        f"{begin}: on the training frames, the loss beyond that of the reconstruction is {excess:.0%} of the static "
+        f"{begin}: on training frames, the loss beyond the reconstruction's is {100 * excess:.0f} % of the static "
         f"prediction's{falls}.",
         *more,
     ]
@@ -266,17 +263,14 @@ def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> N
         method.take_over(source.method.fitted if isinstance(source.method, StagedFit) else source.simulator)
 
 
-def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None) -> Trainer:
-    """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run.
-
-    The epochs of a plan, if given, replace ``trainer.max_epochs``.
-    """
+def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int) -> Trainer:
+    """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run."""
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node]
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
     loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs if epochs is None else epochs}
-    settings = instantiate(cfg.trainer, **length)
-    return make_trainer(settings, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
+    return make_trainer(
+        instantiate(cfg.trainer), epochs=epochs, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew
+    )
 
 
 def _introduce(
@@ -297,12 +291,13 @@ def _introduce(
         lines += [f"note: {note}" for note in module.method.fitted.notes()]
     else:
         kind = type(module.supervision).__name__
-        batches, epochs = len(datamodule.train_dataloader()), trainer.max_epochs or 0
-        shows, frames = epochs * datamodule.repeats, sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
+        plan, batches = module.plan, len(datamodule.train_dataloader())
+        epochs = plan.epochs or 1
+        shows, frames = epochs * plan.repeats, sum(plan.steps(epoch) * batches for epoch in range(epochs))
         lines = [
             f"compared with {COMPARED.get(kind, kind)}",
-            f"at most {epochs} epochs of {batches} steps, {shows} shows of each sequence; "
-            f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames",
+            f"{epochs} epochs of {batches} steps, {shows} shows of each sequence; "
+            f"T {plan.steps(0)} to {plan.t_max}, {frames} predicted frames",
             *_slow_beginnings(module, shows),
         ]
         config = run.config()
@@ -323,5 +318,5 @@ def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
     return [
         f"warning: in {shows} shows at optimizer.initial_lr={rate:g} an initial state moves by {reach:.2g} of the "
         f"diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
-        f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or trainer.max_epochs."
+        f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or plan.epochs."
     ]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +24,7 @@ from gausim.training.fitted.fitting import StagedFit
 from gausim.training.fitted.stages import StagedCurriculum
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
+from gausim.training.plan import DataFacts, TrainingPlan
 from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources
 
@@ -55,13 +57,13 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
             "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
             f"{sorted(str(k) for k in config.model)}."
         )
-    plan, settings = None, {}
-    if fits:  # the plan sets T and the shows per epoch; sequences are fitted independently
+    datamodule = open_data(config, sealed=sealed)
+    course = resolved_plan(config, datamodule)
+    datamodule.plan = course
+    plan = None
+    if fits:  # its stages set T and the shows per epoch
         plan = instantiate(config.model.plan)
-        curriculum = StagedCurriculum(t_start=1, t_max=int(config.data.curriculum.t_max), plan=plan)
-        settings = {"curriculum": curriculum, "repeats": plan.shows, "batch_size": config.data.batch_size or 1}
-    datamodule = instantiate(config.data, **settings)
-    datamodule.sealed = sealed
+        datamodule.plan = StagedCurriculum(plan, course.t_max or 1, course.batch_size or 1)
     scenes = [item.scene() for item in datamodule.objects]
     given = {"scenes": scenes, "fps": [item.fps for item in datamodule.objects]}
     renderer, objective = instantiate(config.render), instantiate(config.loss)
@@ -71,8 +73,8 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         smooth, learns = model.smooth_motions, objective
     else:
         given |= {"scene_of_sequence": [scene_id for scene_id, _ in datamodule.index.entries]}
-        fitted = instantiate(config.model.method, **given, seen=datamodule.curriculum.t_max)()
-        method = StagedFit(fitted, plan, datamodule.curriculum, objective.explosion)
+        fitted = instantiate(config.model.method, **given, seen=course.t_max)()
+        method = StagedFit(fitted, plan, cast(StagedCurriculum, datamodule.plan), objective.explosion)
         smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
     sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image, method.references)
     node = config.get("supervision")
@@ -82,9 +84,56 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         objective=learns,
         optimizer=None if fits else instantiate(config.optimizer),
         supervision=instantiate(node)(sources) if node else None,
+        plan=course,
         seed=int(config.seed),
     )
     return module, datamodule
+
+
+def open_data(config: DictConfig, *, sealed: bool = True) -> ReadyDataModule:
+    """The data module of a configuration; ``sealed`` is that of :func:`build`."""
+    datamodule: ReadyDataModule = instantiate(config.data)
+    datamodule.sealed = sealed
+    return datamodule
+
+
+def resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingPlan:
+    """The training plan of a configuration, resolved for its data."""
+    plan: TrainingPlan = instantiate(config.plan)
+    trainer, count = config.trainer, datamodule.trained()[0]
+    ranks = int(trainer.get("devices", 1)) * int(trainer.get("num_nodes", 1))
+    frames = min(len(item.train_frames) for item in datamodule.objects)
+    if "method" not in config.model:
+        return plan.resolved(DataFacts(count, frames, _can_warm_start(config, datamodule)), ranks=ranks)
+    # The sequences are fitted independently, in stages of their own.
+    own = instantiate(config.model.plan)
+    plan = replace(plan, epochs=max(1, own.epochs), repeats=own.shows, batch_size=plan.batch_size or 1)
+    return plan.resolved(DataFacts(count, frames, can_warm_start=False))
+
+
+def _can_warm_start(config: DictConfig, datamodule: ReadyDataModule) -> bool:
+    if not datamodule.has_videos:
+        return False
+    bodies = [item.surroundings for item in datamodule.objects]
+    if any(body.free or body.floor is not None for body in bodies):
+        return False
+    compared = str((config.get("supervision") or {}).get("_target_", "")).rpartition(".")[2]
+    return compared != "PointSupervision" or all(record.hands is None for _, record in datamodule.index.entries)
+
+
+def with_resolved_plan(config: DictConfig) -> DictConfig:
+    """A training configuration that states what its plan leaves to the data.
+
+    Raises:
+        GausSimError: the data are missing or damaged, or the plan does not fit them.
+    """
+    plan, found = resolved_plan(config, open_data(config)), copy.deepcopy(config)
+    OmegaConf.set_struct(found, False)
+    found.plan = {**found.plan, **plan.settings()}
+    if "method" in config.model:
+        found.plan.repeats = plan.repeats
+    OmegaConf.set_struct(found, True)
+    return found
 
 
 def _shared_simulator(config: DictConfig, model: Any, datamodule: ReadyDataModule) -> SharedSimulator:

@@ -54,11 +54,12 @@ class RootConfig:
     """Schema of the root keys of a training configuration: a misspelt root key is an error.
 
     Attributes:
-        data: the data module: which set, views, frames and batches.
+        data: the data module: which set, views and frames.
+        plan: the training plan: epochs, predicted frames, batches, learning-rate schedule, warm start and end.
         model: the dynamics.
         supervision: reference of the predictions: images by default, or points or motion tracks.
         loss: the terms and their weights.
-        optimizer: the optimiser (partial, without its parameters) and its schedule.
+        optimizer: the optimiser (partial, without its parameters) and its rates.
         render: the renderer.
         trainer: arguments of the Lightning trainer.
         logger: loggers by name.
@@ -80,6 +81,7 @@ class RootConfig:
     """
 
     data: Any = MISSING
+    plan: Any = MISSING
     model: Any = MISSING
     supervision: Any = None
     loss: Any = MISSING

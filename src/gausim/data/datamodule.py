@@ -12,21 +12,19 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from gausim.core import ConfigError
-from gausim.data.curriculum import Curriculum
 from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample, collate
 from gausim.data.objects import ObjectData, find_objects
-from gausim.data.sampler import SequenceBatchSampler
+from gausim.data.sampler import SequenceBatchSampler, Shows
 from gausim.ops.selection import Selection
 
 
 class ReadyDataModule(LightningDataModule):
-    """Streams multi-view sequences of one or several objects; the curriculum sets their length.
+    """Streams multi-view sequences of one or several objects; the plan sets their number and length.
 
     Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only).
 
     Attributes:
-        repeats: how many times each sequence is shown per epoch.
-        curriculum: predicted steps per epoch.
+        plan: shows, batch size and predicted frames; set before training batches are asked for.
         has_videos: whether its objects were filmed.
         sealed: whether unseen frames and the true motion of the test part are refused; set before objects are read.
     """
@@ -40,9 +38,7 @@ class ReadyDataModule(LightningDataModule):
         scene: str | Path | None = None,
         masks: str | Path | None = None,
         selections: Mapping[str, Selection | str] | None = None,
-        batch_size: int | None = None,
-        repeats: int = 4,
-        curriculum: Curriculum | None = None,
+        plan: Shows | None = None,
         seed: int = 0,
         prefetch: int = 0,
         names: Sequence[str] | None = None,
@@ -57,9 +53,7 @@ class ReadyDataModule(LightningDataModule):
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
-            batch_size: sequences per optimiser step, divided among the ranks; a third of all, 1 to 4, when None.
-            repeats: how many times each sequence is shown per epoch.
-            curriculum: predicted steps per epoch; that of METHOD section 4 when None.
+            plan: the resolved training plan, or its part that data follow.
             seed: seed of the training order.
             prefetch: number of batches that a process of its own reads ahead; 0 reads each when it is asked for.
             names: names of the objects to use; all when None.
@@ -71,8 +65,7 @@ class ReadyDataModule(LightningDataModule):
         self._root, self._names, self._sequences = root, names, sequences
         self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections, "test": test}
         self.sealed = True
-        self._batch_size, self.repeats, self._seed, self._prefetch = batch_size, repeats, seed, prefetch
-        self.curriculum = curriculum if curriculum is not None else Curriculum()
+        self.plan, self._seed, self._prefetch = plan, seed, prefetch
         self._sampler: SequenceBatchSampler | None = None
 
     @cached_property
@@ -91,9 +84,7 @@ class ReadyDataModule(LightningDataModule):
         absent = [name for name in self._names or () if name not in have]
         if absent or self._names == []:
             raise ConfigError(f"data.names: {list(self._names or ())} asked for, the roots hold {have}.")
-        chosen = [item for item in found if self._names is None or item.name in self._names]
-        self.curriculum.see(min(len(item.train_frames) for item in chosen))
-        return chosen
+        return [item for item in found if self._names is None or item.name in self._names]
 
     @cached_property
     def index(self) -> SequenceIndex:
@@ -103,14 +94,13 @@ class ReadyDataModule(LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Opens the objects and determines the training order, before a checkpoint's position is loaded."""
         if stage in (None, "fit"):
-            self._check_curriculum()
+            if self.plan is None:
+                raise ConfigError("data: expected a resolved training plan (gausim.training.plan), got none.")
             rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
             count, frames = self.trained()
-            size = max(ranks, min(4, count // 3)) if self._batch_size is None else self._batch_size
             self._sampler = SequenceBatchSampler(
-                count, batch_size=size, repeats=self.repeats, curriculum=self.curriculum, seed=self._seed,
-                rank=rank, world_size=ranks, frames=frames,
-            )  # fmt: skip
+                count, plan=self.plan, seed=self._seed, rank=rank, world_size=ranks, frames=frames
+            )
 
     def trained(self) -> tuple[int, list[int] | None]:
         """The number of sequences to train on and, where samples start at any frame, their numbers of frames."""
@@ -123,17 +113,17 @@ class ReadyDataModule(LightningDataModule):
 
     def introduction(self) -> list[str]:
         """A line per object, and one about what of it is not trained on."""
-        lines, first = [], self.curriculum.t_max + 1
+        lines, first = [], (self.plan.t_max or 0) + 1 if self.plan else 0
         for item in self.objects:
             cameras = item.sequences[0].cameras
             lines.append(
                 f"{item.name}: {len(item.sequences)} sequences, {len(item.train_views)} views of "
                 f"{cameras.width}x{cameras.height}, {item.fps:g} fps"
             )
-            if first < item.train_frames.stop:
+            if 0 < first < item.train_frames.stop:
                 lines.append(
                     f"{item.name}: frames {first}..{item.train_frames.stop - 1} are seen, but not trained on "
-                    f"(data.curriculum.t_max={first - 1})"
+                    f"(plan.t_max={first - 1})"
                 )
             sealed = [record.name for record in item.sequences if record.limit is not None]
             if sealed:
@@ -146,10 +136,6 @@ class ReadyDataModule(LightningDataModule):
     def training_sample(self, sequence: int, steps: int) -> SequenceSample:
         """Frames 0..``steps`` of a sequence in the training views."""
         return self.index[SampleKey(sequence, steps)]
-
-    def steps(self, epoch: int) -> int:
-        """Predicted steps T in an epoch."""
-        return self.curriculum.steps(epoch)
 
     def train_dataloader(self) -> DataLoader:
         """Batches of training samples.
@@ -204,12 +190,3 @@ class ReadyDataModule(LightningDataModule):
         if len(roots) > 1 and any(options[key] is not None for key in ("scene", "masks")):
             raise ConfigError(f"data.root: 'scene' and 'masks' are of one object, but {root} holds {len(roots)}.")
         return [ObjectData(r, sequences=self._sequences, sealed=self.sealed, **options) for r in roots]
-
-    def _check_curriculum(self) -> None:
-        for item in self.objects:
-            if self.curriculum.t_max >= len(item.train_frames):
-                raise ConfigError(
-                    f"data.curriculum.t_max: {self.curriculum.t_max} steps would see frame {self.curriculum.t_max}, "
-                    f"but '{item.name}' trains on frames 0..{item.train_frames.stop - 1}; "
-                    f"at most {len(item.train_frames) - 1} steps."
-                )

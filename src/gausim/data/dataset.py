@@ -99,7 +99,7 @@ class SequenceIndex(Dataset):
             raise DataError(
                 f"{item.name}: {steps} predicted steps asked for, the training frames "
                 f"{item.train_frames.start}..{item.train_frames.stop - 1} allow 1..{len(item.train_frames) - 1}. "
-                "Lower the curriculum's t_max."
+                "Lower plan.t_max."
             )
         return self.sample(sequence, range(steps + 1), item.train_views)
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, SimState
 from gausim.data.corpus import BodyRecord, Corpus, CorpusBody
-from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample
 from gausim.data.records import GroundTruth
+from gausim.data.sampler import Shows
 
 # Bodies of which the motion stays in memory.
 BODIES_IN_MEMORY = 128
@@ -141,9 +141,7 @@ class CorpusDataModule(ReadyDataModule):
         bodies: int | None = None,
         held_out: int = 12,
         seen: int = 16,
-        batch_size: int = 4,
-        repeats: int = 1,
-        curriculum: Curriculum | None = None,
+        plan: Shows | None = None,
         seed: int = 0,
         prefetch: int = 0,
     ) -> None:
@@ -155,15 +153,11 @@ class CorpusDataModule(ReadyDataModule):
             bodies: number of bodies to train on; all but the ones held out when None.
             held_out: number of bodies held out.
             seen: frames that count as seen in the figures, and the ones used with ``part=held_out``.
-            batch_size: sequences per optimiser step.
-            repeats: how many times each sequence is shown per epoch.
-            curriculum: predicted steps per epoch.
+            plan: the resolved training plan, or its part that data follow.
             seed: seed of the training order.
             prefetch: number of batches that a process of its own reads ahead.
         """
-        super().__init__(
-            root, batch_size=batch_size, repeats=repeats, curriculum=curriculum, seed=seed, prefetch=prefetch
-        )
+        super().__init__(root, plan=plan, seed=seed, prefetch=prefetch)
         if part not in ("train", "held_out") or held_out < 1:
             raise ConfigError(
                 f"data.part, data.held_out: expected train or held_out and a number >= 1, got {part}, {held_out}."
@@ -187,7 +181,6 @@ class CorpusDataModule(ReadyDataModule):
                 f"{self._root} has {len(corpus)}."
             )
         chosen = [*(range(wanted) if self.knows_material else ()), *range(first, len(corpus))]
-        self.curriculum.see(self.seen)
         read = lru_cache(BODIES_IN_MEMORY)(corpus.body)
         return [BodyData(partial(read, i), corpus.manifest.bodies[i], self.seen) for i in chosen]
 

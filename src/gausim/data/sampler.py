@@ -3,13 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Protocol
 
 import torch
 from torch.utils.data import Sampler
 
 from gausim.core import ConfigError
-from gausim.data.curriculum import Curriculum
 from gausim.data.dataset import SampleKey
+
+
+class Shows(Protocol):
+    """The part of a training plan that data follow (:class:`gausim.training.plan.TrainingPlan`)."""
+
+    @property
+    def repeats(self) -> int:
+        """Shows of each sequence per epoch."""
+
+    @property
+    def batch_size(self) -> int | None:
+        """Sequences per optimiser step, divided among the ranks."""
+
+    @property
+    def t_max(self) -> int | None:
+        """Most predicted frames."""
+
+    def steps(self, epoch: int) -> int:
+        """Predicted frames T in an epoch."""
 
 
 class SequenceBatchSampler(Sampler[list[SampleKey]]):
@@ -27,32 +46,26 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         self,
         count: int,
         *,
-        batch_size: int,
-        repeats: int,
-        curriculum: Curriculum,
+        plan: Shows,
         seed: int,
         rank: int = 0,
         world_size: int = 1,
         frames: Sequence[int] | None = None,
     ) -> None:
-        """Divides ``count`` sequences into batches of ``batch_size`` over all ranks.
+        """Divides ``count`` sequences into batches of the plan's size over all ranks.
 
         ``frames`` are the numbers of frames of the sequences, if samples may start at any frame; else at the first.
 
         Raises:
             ConfigError: a number is out of range, or a batch has fewer sequences than ranks.
         """
-        if min(count, batch_size, repeats) < 1:
-            raise ConfigError(
-                f"data: sequences ({count}), batch_size ({batch_size}) and repeats ({repeats}) must be at least 1."
-            )
+        batch_size = plan.batch_size or 0
         if batch_size < world_size:
             raise ConfigError(
-                f"data.batch_size: expected at least one sequence for each of the {world_size} ranks, got {batch_size} "
-                f"per optimiser step. Set data.batch_size={world_size} or a multiple, or trainer.devices={batch_size}."
+                f"plan.batch_size: expected at least one sequence for each of the {world_size} ranks, got {batch_size} "
+                f"per optimiser step. Set plan.batch_size={world_size} or a multiple, or trainer.devices={batch_size}."
             )
-        self._count, self._batch_size, self._repeats = count, batch_size, repeats
-        self._curriculum, self._seed = curriculum, seed
+        self._count, self._batch_size, self._plan, self._seed = count, batch_size, plan, seed
         self._rank, self._world_size, self._frames = rank, world_size, frames
         self.epoch = 0
         # One attribute, so that a cancelled iteration cannot change the position of the next epoch.
@@ -76,7 +89,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
 
     def __len__(self) -> int:
         """Number of batches per epoch."""
-        return -(-self._count * self._repeats // self._batch_size)
+        return -(-self._count * self._plan.repeats // self._batch_size)
 
     def order(self, epoch: int) -> list[int]:
         """Sequence ids of an epoch.
@@ -85,7 +98,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         """
         generator = torch.Generator().manual_seed(hash_seed(self._seed, epoch))
         order: list[int] = []
-        for _ in range(self._repeats):
+        for _ in range(self._plan.repeats):
             permutation = torch.randperm(self._count, generator=generator).tolist()
             open_batch = set(order[len(order) - len(order) % self._batch_size :])
             order += [i for i in permutation if i not in open_batch] + [i for i in permutation if i in open_batch]
@@ -94,7 +107,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
     def __iter__(self) -> Iterator[list[SampleKey]]:
         """Yields this rank's slice of each batch from the current position on; it may be empty."""
         epoch, position, size = self.epoch, self.position, self._batch_size
-        steps, order = self._curriculum.steps(epoch), self.order(epoch)
+        steps, order = self._plan.steps(epoch), self.order(epoch)
         batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
         starts = self._starts(order, steps)
         for number in range(position if position < len(batches) else 0, len(batches)):

@@ -95,12 +95,20 @@ class TrainingCost:
 
     def state_dict(self) -> dict[str, float]:
         """Cost up to now as plain numbers."""
+        self._advance()
+        self.peak_bytes = max(self.peak_bytes, float(peak_bytes() or 0))
+        return self.summary()
+
+    def minutes(self, clock: str) -> float:
+        """Time up to now by the clock ``wall`` or ``cpu`` [minutes]."""
+        self._advance()
+        return (self.seconds if clock == "wall" else self.cpu_seconds) / 60
+
+    def _advance(self) -> None:
         wall, processor = self._mark
         self.begin()
         self.seconds += self._mark[0] - wall
         self.cpu_seconds += self._mark[1] - processor
-        self.peak_bytes = max(self.peak_bytes, float(peak_bytes() or 0))
-        return self.summary()
 
     def load_state_dict(self, state: Mapping[str, float]) -> None:
         """Continues from the result of :meth:`state_dict`."""

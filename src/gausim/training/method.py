@@ -17,7 +17,8 @@ from gausim.losses.objective import Objective
 from gausim.models.reference.reference import Carried, UnitMotion, hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.training.contracts import Simulator
-from gausim.training.optimizers import OptimizerSettings
+from gausim.training.optimizers import OptimizerSettings, set_rates
+from gausim.training.plan import TrainingPlan
 from gausim.training.terms.mixing import mixing_term
 from gausim.training.terms.rest import rest_term
 from gausim.training.terms.term import Term
@@ -25,22 +26,11 @@ from gausim.training.terms.term import Term
 
 @dataclass(frozen=True)
 class Moment:
-    """Position of an optimiser step in a run: after ``epoch`` of ``epochs`` and ``batch`` of ``batches`` in the epoch.
+    """Position of an optimiser step: ``batch`` of ``batches`` in its epoch, and the part of the run that is done."""
 
-    The fraction done is at least ``least``, the part of the time budget that is used.
-    """
-
-    epoch: int
     batch: int
     batches: float
-    epochs: int
-    least: float = 0.0
-
-    @property
-    def done(self) -> float:
-        """Epochs done, for schedules of learning rates."""
-        done = self.epoch + self.batch / max(1.0, self.batches)
-        return max(done, self.least * self.epochs)
+    progress: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ class Method(ABC):
         """The optimiser over all groups; None without trainable parameters."""
 
     @abstractmethod
-    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
+    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, plan: TrainingPlan, now: Moment) -> Task:
         """Sets the learning rates, and returns the settings of the step."""
 
     @abstractmethod
@@ -117,7 +107,7 @@ class Method(ABC):
         return None
 
     def end_epoch(self, least: float) -> bool:
-        """Prepares the next epoch; returns whether training is over. ``least`` is that of :class:`Moment`."""
+        """Prepares the next epoch; returns whether training is over. ``least`` is the used part of the time."""
         return False
 
     def notes(self) -> list[str]:
@@ -172,11 +162,11 @@ class SharedSimulator(Method):
         """One optimiser over the groups of the model and the initial states."""
         return settings.build({name: [p for p in own if p.requires_grad] for name, own in self.groups().items()})
 
-    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
-        """Sets the learning rates by the schedule."""
+    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, plan: TrainingPlan, now: Moment) -> Task:
+        """Sets the learning rates by the plan."""
         shared = getattr(self.model, "shared_groups", ("network",))
-        factor = settings.set_rates(optimizer, now.done, now.epochs, shared)
-        return Task(settings.network_lr * factor)
+        set_rates(optimizer, lambda name: plan.rate_factor(name, now.progress, shared=name in shared))
+        return Task(settings.network_lr * plan.rate_factor("network", now.progress))
 
     def terms(self) -> Sequence[Term]:
         """The static loss and the penalty on mode mixing."""

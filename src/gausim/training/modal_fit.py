@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -20,11 +20,12 @@ from torch import Tensor, nn
 
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.modal import ModalScene
-from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
+from gausim.nn.schedules import CosineSchedule
+from gausim.training.optimizers import OptimizerSettings, set_rates
 
 # Predicted frames in the first update.
 SHORTEST = 2
-FALLING = StableDecaySchedule(warmup=0.0, decay=1.0)
+FALLING = CosineSchedule(warmup=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +79,13 @@ def fit(
         updates: number of updates.
         growing: fraction of the updates over which T grows to its largest.
     """
-    settings = replace(settings, schedule=FALLING)
     trained = {name: [p for p in own if p.requires_grad] for name, own in groups.items()}
     weights = [p for own in trained.values() for p in own]
     optimizer, least, kept = settings.build(trained), math.inf, [p.detach().clone() for p in weights]
     for update in range(updates):
         steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / growing))
-        settings.set_rates(optimizer, update, updates)
+        falling = FALLING.factor(update, updates)
+        set_rates(optimizer, lambda name, factor=falling: factor)  # type: ignore[misc]
         optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for scene_id, known in motions:

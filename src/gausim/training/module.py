@@ -15,9 +15,11 @@ from gausim.data.sampler import hash_seed
 from gausim.runs.checkpoint import check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
 from gausim.training.method import Moment
+from gausim.training.plan import TrainingPlan
 from gausim.training.statistics import Baselines
 from gausim.training.step import OptimiserStep
 from gausim.training.supervision.motion_tracks import TrackSupervision
+from gausim.training.warm_start import warm_start
 
 # Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
@@ -33,10 +35,13 @@ class GausSimModule(OptimiserStep, LightningModule):
     a single rank.
     """
 
-    def __init__(self, *, seed: int = 0, fraction_every: int = 50, **parts: Any) -> None:
+    def __init__(
+        self, *, plan: TrainingPlan | None = None, seed: int = 0, fraction_every: int = 50, **parts: Any
+    ) -> None:
         """Stores the ``parts`` of a :class:`~gausim.training.learner.Learner`.
 
         Args:
+            plan: the resolved plan; constant rates when None.
             seed: seed of each step's random numbers (static loss, free motion), together with the step's number.
             fraction_every: optimiser steps between measurements of the momentum loss's gradient fraction; 0 is never.
             parts: arguments of the learner.
@@ -46,7 +51,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         self.seed, self.fraction_every, self.measuring = seed, fraction_every, bool(fraction_every)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
-        self.time_fraction = 0.0
+        self.plan, self.minutes = plan or TrainingPlan(), 0.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self.cost = not self.method.warns, TrainingCost()
 
@@ -70,9 +75,10 @@ class GausSimModule(OptimiserStep, LightningModule):
     def training_step(self, samples: list[SequenceSample], batch_idx: int) -> None:
         """Predicts and renders the batch, and makes one optimiser step."""
         optimizer, trainer = cast(Any, self.optimizers()), self.trainer
-        batches, epochs = float(trainer.num_training_batches), trainer.max_epochs or 1
-        now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction)
-        task = self.method.begin_step(optimizer.optimizer, self.settings, now)
+        batches = float(trainer.num_training_batches)
+        done = self.plan.progress(self.current_epoch + batch_idx / max(1.0, batches), self.minutes)
+        now = Moment(batch_idx, batches, done)
+        task = self.method.begin_step(optimizer.optimizer, self.settings, self.plan, now)
         if task.is_new:
             self.baselines = Baselines(self.supervision)
         if task.objective is not None:
@@ -82,6 +88,14 @@ class GausSimModule(OptimiserStep, LightningModule):
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
         self._record({**stats, "lr": task.rate}, self.shown)
+        self._look_at_the_clock()
+        if self.plan.time_fraction(self.minutes) >= 1:
+            trainer.should_stop = True
+
+    def _look_at_the_clock(self) -> None:
+        """Measures the training time, on the first rank for all: their learning rates and their end must agree."""
+        if self.plan.max_minutes is not None:
+            self.minutes = self.ranks.first(lambda: self.cost.minutes(self.plan.clock))
 
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss, through the trainer if there is one."""
@@ -108,8 +122,12 @@ class GausSimModule(OptimiserStep, LightningModule):
         return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
 
     def on_train_start(self) -> None:
-        """Starts to measure the cost of training."""
+        """Starts to measure the cost of training, and makes the warm start of a run that is not resumed."""
         self.cost.begin()
+        self._look_at_the_clock()
+        if self.plan.warm_start is not None and not self.global_step:
+            quiet = not self.trainer.progress_bar_callback
+            warm_start(self, cast(Any, self.trainer).datamodule, self.plan.warm_start, quiet=quiet)
 
     def on_train_epoch_start(self) -> None:
         """Resets the epoch's sums."""
@@ -126,11 +144,11 @@ class GausSimModule(OptimiserStep, LightningModule):
             self._warned = True
             warnings.warn(
                 f"the prediction has collapsed to the rest state: it moves with {100 * energy:.1f} % of the true "
-                "motion energy. Let T grow more slowly (data.curriculum.epochs_per_increase), raise "
+                "motion energy. Let T grow more slowly (plan.epochs_per_increase), raise "
                 "optimizer.initial_lr or use loss.backprop_steps > 1.",
                 stacklevel=2,
             )
-        if self.method.end_epoch(self.time_fraction):
+        if self.method.end_epoch(self.plan.time_fraction(self.minutes)):
             self.trainer.should_stop = True
 
     # ------------------------------------------------------------------------------------------------ checkpoints

@@ -15,20 +15,16 @@ from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
 from gausim.runs.cost import keep_freed_memory
 from gausim.training.callbacks.resume import ExactResume
-from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.ranks.launch import Crew
 from gausim.training.ranks.layout import Layout, RanksStrategy
 
 
 @dataclass(frozen=True)
 class TrainerSettings(Layout):
-    """Length, precision and devices of a training: the keys of ``conf/trainer`` explain the settings."""
+    """Precision and devices of a training: the keys of ``conf/trainer`` explain the settings."""
 
-    max_epochs: int = 120
     threads: int | None = None
     precision: str = "32-true"
-    max_minutes: float | None = None
-    clock: str = "wall"
     log_every_n_steps: int = 20
     progress: bool = True
 
@@ -36,12 +32,13 @@ class TrainerSettings(Layout):
 def make_trainer(
     settings: TrainerSettings,
     *,
+    epochs: int,
     run_dir: Path | None = None,
     callbacks: Sequence[Callback] = (),
     loggers: Sequence[Logger] = (),
     crew: Crew | None = None,
 ) -> Trainer:
-    """The Lightning trainer of a run.
+    """The Lightning trainer of a run of ``epochs``, those of the module's plan.
 
     Files go to ``run_dir``; the ``crew`` has the ranks, if there are several.
 
@@ -58,10 +55,8 @@ def make_trainer(
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
     own: list[Callback] = [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
-    if settings.max_minutes is not None:
-        own.append(TimeBudget(minutes=settings.max_minutes, clock=settings.clock))
     return Trainer(
-        max_epochs=settings.max_epochs,
+        max_epochs=epochs,
         accelerator=settings.accelerator,
         devices=settings.devices,
         num_nodes=settings.num_nodes,

@@ -15,6 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gausim.compose.build import with_resolved_plan
 from gausim.core.errors import BusyError, GausSimError, RunError
 from gausim.runs.directory import RunDirectory, one_line
 
@@ -70,7 +71,7 @@ def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
     if cfg.overwrite:
         return None
     if run.is_finished:
-        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+        config = cast("dict[str, Any]", OmegaConf.to_container(with_resolved_plan(cfg), resolve=True))
         run.check_unchanged(config)
         if cfg.evaluate and run.awaits_evaluation(config):
             return None

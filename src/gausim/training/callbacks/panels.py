@@ -29,7 +29,7 @@ PREDICTION, STATIC = "prediction", "static"
 class Panels(Callback):
     """Renders predictions of the first sequence of every object in its first training camera.
 
-    Frames 0..``t_max`` of the curriculum are predicted, whatever the current T; unseen frames are not read. Videos,
+    Frames 0..``t_max`` of the plan are predicted, whatever the current T; unseen frames are not read. Videos,
     pictures and tables go to ``panels/`` of the run and to every logger that shows media, errors as numbers to every
     logger. There is no effect on training.
     """
@@ -84,7 +84,7 @@ class Panels(Callback):
         first: dict[int, int] = {}
         for sequence, (scene_id, _) in enumerate(data.index.entries):
             first.setdefault(scene_id, sequence)
-        frames = range(data.curriculum.t_max + 1)
+        frames = range((data.plan.t_max or 0) + 1 if data.plan else 0)
         chosen = list(first.items())[: self._objects]
         return [data.index.sample(s, frames, data.objects[i].train_views[:1]).to(module.device) for i, s in chosen]
 

@@ -14,8 +14,6 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 
 from gausim.runs.names import EPOCHS
-from gausim.training.callbacks.cadence import training_data
-from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.module import GausSimModule
 from gausim.training.table import Table, short
 
@@ -100,10 +98,11 @@ def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float
     shown = sum(steps for steps, _ in paces)
     if done >= epochs or not shown:
         return None
-    data = training_data(trainer)
-    frames = sum(data.steps(epoch) for epoch in range(done, epochs))
-    budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
-    return min([frames * sum(seconds for _, seconds in paces) / shown / 60.0, *budgets])
+    module = cast(GausSimModule, trainer.lightning_module)
+    frames = sum(module.plan.steps(epoch) for epoch in range(done, epochs))
+    left = frames * sum(seconds for _, seconds in paces) / shown / 60.0
+    limit = module.plan.max_minutes
+    return left if limit is None else min(left, limit - module.minutes)
 
 
 class Progress(RichProgressBar):

@@ -22,6 +22,7 @@ from gausim.models.hierarchy.batch import Member
 from gausim.training.fitted.stages import FitPlan, StagedCurriculum
 from gausim.training.method import Method, Moment, Task
 from gausim.training.optimizers import OptimizerSettings
+from gausim.training.plan import TrainingPlan
 from gausim.training.rollout import Frame
 from gausim.training.terms.term import StepInputs, Term
 
@@ -133,7 +134,7 @@ class StagedFit(Method):
         made = [{"params": own, "lr": 0.0, "name": name} for name, own in self.groups().items() if own]
         return (self.plan.optimizer or Adam)(made) if made and self.plan.order else None
 
-    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
+    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, plan: TrainingPlan, now: Moment) -> Task:
         """Enters the stage of the epoch and sets its learning rates; the largest is logged."""
         batches = max(1.0, now.batches)
         name, stage, begun = self.plan.place(self.curriculum.position)

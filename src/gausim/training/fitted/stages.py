@@ -9,9 +9,8 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from gausim.core import ConfigError
-from gausim.data.curriculum import Curriculum
 from gausim.losses.image import ImageLoss
-from gausim.training.optimizers import Schedule
+from gausim.nn.schedules import Schedule
 
 
 @dataclass(frozen=True)
@@ -121,26 +120,18 @@ class FitPlan:
         return name, stage, min(float(stage.iterations), rest * self.shows)
 
 
-@dataclass
-class StagedCurriculum(Curriculum):
-    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the number of training frames."""
+class StagedCurriculum:
+    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the largest T."""
 
-    plan: FitPlan = field(default_factory=FitPlan)  # the stages
-    _state: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def __init__(self, plan: FitPlan, t_max: int, batch_size: int = 1) -> None:
+        self.plan, self.t_max, self.batch_size, self.repeats = plan, t_max, batch_size, plan.shows
+        self._state: dict[str, float] = {}
         self.enter(0.0)
 
     @property
     def position(self) -> float:
         """Position in the plan at the beginning of the current epoch [epochs of the plan]."""
         return self._state["position"]
-
-    def see(self, frames: int) -> None:
-        """As for training; T follows."""
-        super().see(frames)
-        self.enter(self.position)
 
     def enter(self, position: float) -> None:
         """Sets stage and T of the next epoch."""

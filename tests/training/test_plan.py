@@ -1,0 +1,153 @@
+"""The training plan: what it decides for every recipe, and that a saved configuration states what ran."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from helpers.simulators import SMALLEST
+from omegaconf import OmegaConf
+from torch import nn
+
+from gausim.cli import train
+from gausim.compose.config import compose, instantiate
+from gausim.core import ConfigError
+from gausim.nn.schedules import CosineSchedule, HalvingSchedule
+from gausim.training.module import GausSimModule
+from gausim.training.optimizers import OptimizerSettings, set_rates
+from gausim.training.plan import DataFacts, TrainingPlan, WarmStart
+
+HELD, FREE = DataFacts(12, 16, can_warm_start=True), DataFacts(12, 16, can_warm_start=False)
+GROUPS = ("network", "scene", "template", "initial")
+
+
+def course(plan: TrainingPlan) -> list[tuple[int, list[float]]]:
+    """T and the factors of the groups at the beginning of each epoch."""
+    assert plan.epochs is not None
+    return [
+        (plan.steps(e), [round(plan.rate_factor(name, plan.progress(e)), 4) for name in GROUPS])
+        for e in range(plan.epochs)
+    ]
+
+
+def cosine(part: float) -> float:
+    return CosineSchedule(warmup=0.0, final=0.05).factor(part, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "data", "epochs", "steps", "factors"),
+    [
+        (["model=gausim"], HELD, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5), 29: cosine(29 / 30)}),
+        (["model=gausim"], FREE, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
+        (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),
+        (["model=gausim", "plan.t_start=3"], HELD, 30, {0: 3, 1: 4, 12: 15}, {15: cosine(0.5)}),
+        (["model=gausim", "plan.warm_start=null"], HELD, 60, {0: 2, 13: 15}, {30: cosine(0.5)}),
+        (["model=gausim_paper"], HELD, 25, {0: 1, 14: 15, 24: 15}, {0: 1, 15: 1, 16: 0.5, 18: 0.25, 24: 0.03125}),
+    ],
+)
+def test_t_and_rates_of_every_recipe(
+    overrides: list[str], data: DataFacts, epochs: int, steps: dict[int, int], factors: dict[int, float]
+) -> None:
+    plan: TrainingPlan = instantiate(compose("train", overrides).plan).resolved(data)
+    found = course(plan)
+    for epoch, (t, rates) in enumerate(found):
+        print(epoch, t, rates)
+    assert len(found) == plan.epochs == epochs and plan.resolved(data) == plan
+    assert {epoch: found[epoch][0] for epoch in steps} == steps
+    warm = data.can_warm_start and "warm_start=null" not in str(overrides) and overrides != ["model=gausim_paper"]
+    assert (plan.warm_start is not None) == warm
+    for epoch, factor in factors.items():
+        own = factor * (0.2 if warm else 1.0)
+        assert found[epoch][1] == pytest.approx([factor, own, own, own], abs=1e-4), epoch
+
+
+@pytest.mark.parametrize(
+    ("frames", "largest", "first"), [(3, 2, [2, 2]), (16, 15, [2, 3, 4]), (42, 41, [2, 5, 8]), (200, 60, [2, 7])]
+)
+def test_t_grows_to_the_seen_frames_of_longer_videos_in_as_many_epochs(
+    frames: int, largest: int, first: list[int]
+) -> None:
+    plan = TrainingPlan().resolved(DataFacts(3, frames, can_warm_start=False))
+    assert plan.t_max == largest == plan.steps(13) and [plan.steps(e) for e in range(len(first))] == first
+    slow = TrainingPlan(t_start=3, t_max=5, epochs_per_increase=2)
+    assert [slow.steps(e) for e in range(8)] == [3, 3, 4, 4, 5, 5, 5, 5]
+
+
+def test_batches_and_limits_follow_the_data() -> None:
+    assert [TrainingPlan().resolved(DataFacts(n, 16, False)).batch_size for n in (1, 7, 40)] == [1, 2, 4]
+    assert TrainingPlan().resolved(DataFacts(3, 16, False), ranks=3).batch_size == 3
+    with pytest.raises(ConfigError, match=r"plan\.t_max: 16 predicted frames would see frame 16, .*at most 15"):
+        TrainingPlan(t_max=16).resolved(HELD)
+    timed = TrainingPlan(epochs=10, max_minutes=2.0)
+    assert timed.progress(5, 0.5) == 0.5 and timed.progress(5, 1.5) == 0.75 and timed.progress(11, 0) == 1
+    assert timed.time_fraction(3.0) == 1 and TrainingPlan().time_fraction(1e9) == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"epochs": 0}, r"plan\.epochs: expected at least 1"),
+        ({"t_start": 5, "t_max": 4}, r"t_start <= t_max"),
+        ({"epochs_per_increase": 0}, r"plan\.epochs_per_increase"),
+        ({"shared_from": 1.0}, r"plan\.shared_from: expected a fraction"),
+        ({"clock": "moon"}, r"clock wall or cpu"),
+        ({"max_minutes": 0.0}, r"max_minutes > 0"),
+    ],
+)
+def test_wrong_plans_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        TrainingPlan(**wrong)
+    for fit in ({"updates": 0}, {"decay": -0.1}, {"growing": 0.0}):
+        with pytest.raises(ConfigError, match=r"plan\.warm_start: expected"):
+            WarmStart(**fit)  # type: ignore[arg-type]
+
+
+def test_schedules() -> None:
+    halving = HalvingSchedule(first=16, every=2)
+    assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]
+    stable = CosineSchedule(warmup=2.0, decay=0.25, final=0.1)
+    assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
+
+
+def test_shared_weights_wait_for_their_part_of_the_run() -> None:
+    settings, plan = OptimizerSettings(network_lr=0.1, scene_lr=0.2, template_lr=0.3), TrainingPlan(shared_from=0.5)
+    optimizer = settings.build({name: [nn.Parameter(torch.zeros(1))] for name in ("network", "scene", "template")})
+    found = []
+    for done, shared in ((0.49, ("network", "template")), (0.49, ("network",)), (0.5, ("network", "template"))):
+        set_rates(optimizer, lambda n, done=done, shared=shared: plan.rate_factor(n, done, shared=n in shared))
+        found.append([group["lr"] for group in optimizer.param_groups])
+    assert found == [[0.0, 0.2, 0.0], [0.0, 0.2, 0.3], [0.1, 0.2, 0.3]]
+
+
+@pytest.mark.parametrize("start", [["plan.warm_start.updates=5"], ["plan.warm_start=null"]])
+def test_a_saved_configuration_states_what_ran(
+    start: list[str], toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[int, float, dict[str, float]]] = []
+    step = GausSimModule.training_step
+
+    def watched(self: GausSimModule, samples: Any, batch_idx: int) -> None:
+        step(self, samples, batch_idx)
+        rates = {group["name"]: group["lr"] for group in self.trainer.optimizers[0].param_groups}
+        done = self.current_epoch + batch_idx / self.trainer.num_training_batches
+        ran.append((samples[0].steps, done, rates))
+
+    monkeypatch.setattr(GausSimModule, "training_step", watched)
+    quick = [x for x in SMALLEST if "warm_start" not in x]
+    more = ["model.simulator.template.modes=6", "render=cpu", "logger=none", "callbacks.motion=null", "plan.repeats=1"]
+    common = [f"data.root={toy}", "model=gausim", *quick, *more, *start, "plan.epochs=3", f"hydra.run.dir={tmp_path}"]
+    assert train.main(common) == 0
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert saved["plan"]["epochs"] == 3 and saved["plan"]["t_max"] == 7 and saved["plan"]["batch_size"] == 1
+    assert (saved["plan"]["warm_start"] is None) == (start == ["plan.warm_start=null"])
+    assert saved["plan"]["t_start"] == (2 if saved["plan"]["warm_start"] is None else 7)
+    plan: TrainingPlan = instantiate(OmegaConf.create(saved["plan"]))
+    rates = {name: saved["optimizer"][f"{name}_lr"] for name in GROUPS}
+    assert len(ran) == 6
+    for steps, done, found in ran:
+        assert steps == plan.steps(int(done))
+        expected = {name: rates[name] * plan.rate_factor(name, plan.progress(done)) for name in found}
+        assert found == pytest.approx(expected)
