@@ -65,12 +65,13 @@ class _Case:
 def measure(
     options: Options, module: GausSimModule, data: ReadyDataModule, others: Mapping[str, GausSimModule]
 ) -> list[Row]:
-    """Times of optimiser steps, and memory, at the curriculum's largest T; weights stay constant.
+    """Times of optimiser steps, and memory, at the plan's largest T; weights stay constant.
 
     ``others`` are modules of the same data for comparison, by the setting that selects them.
     """
     data.setup("fit")
-    steps = min(3, data.curriculum.t_max) if options.quick else data.curriculum.t_max
+    longest = (data.plan.t_max if data.plan else None) or 1
+    steps = min(3, longest) if options.quick else longest
     case = _Case.of(module, data, options, steps)
     cameras = case.samples[0].cameras
     size = f"{len(cameras.names)} views x {cameras.width}x{cameras.height}, T={steps}"

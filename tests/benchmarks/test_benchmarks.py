@@ -17,13 +17,13 @@ from benchmarks import __main__ as command
 from benchmarks import cluster, data, interact, render, step, train
 from benchmarks.harness import Options, Row, cloud, medians, peak_saved_bytes, simulator_of
 from gausim.core import GaussianScene
-from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.losses import Objective
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.plan import TrainingPlan
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 
@@ -72,7 +72,7 @@ def _module(scenes: list[GaussianScene]) -> GausSimModule:
 
 def test_training_is_measured_and_leaves_the_weights(tmp_path: Path) -> None:
     toy = toy_object.write_toy_object(tmp_path / "toy", frames=8)
-    items = ReadyDataModule(toy.root, curriculum=Curriculum(t_max=3), batch_size=2)
+    items = ReadyDataModule(toy.root, plan=TrainingPlan(t_start=1, t_max=3, batch_size=2))
     module, other = (_module([item.scene() for item in items.objects]) for _ in range(2))
     before = {name: value.detach().clone() for name, value in module.named_parameters()}
     rows = train.measure(QUICK, module, items, {"model=other": other})

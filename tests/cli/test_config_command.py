@@ -78,14 +78,14 @@ def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsy
 
 
 def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
-    wrong = ["sed=1", "model.simulator.template.peroid=1", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
+    wrong = ["sed=1", "model.simulator.template.peroid=1", "plan.epoch=3", "render=nope", "seed=x", "freeze=5"]
     assert main(["config", "validate", *wrong, "model=gausim", "plan.max_minutes=soon"]) == 1
     told = capsys.readouterr()
     for expected in (
         "sed: unknown key. Did you mean 'seed'?",
         # Which only this model has.
         "model.simulator.template.peroid: unknown key. Did you mean 'model.simulator.template.period'?",
-        "trainer.max_epoch: unknown key. Did you mean 'plan.epochs'?",
+        "plan.epoch: unknown key. Did you mean 'plan.epochs'?",
         "Available options in 'render': auto cpu gsplat reference",
         "seed=x: Value 'x' of type 'str' could not be converted to Integer",
         "plan.max_minutes: expected a number or null, got 'soon'.",
@@ -114,25 +114,24 @@ def test_a_saved_configuration(once, tmp_path, capsys) -> None:
     saved.write_text(yaml.safe_dump(config))
     assert main(["config", "validate", str(saved.parent)]) == 0
     config["optimiser"] = config.pop("optimizer")
-    config["plan"] |= {"tmax": 3, "repeats": None}
+    config["plan"] |= {"tmax": 3}
     config["model"]["simulator"]["template"]["mode"] = 3
     config["model"]["simulator"]["hierarchy"]["levels"] = [{"diameter": "wide", "edge_length": 1.0}]
     config["sweep"]["retry"] = True
-    config["trainer"]["max_epochs"] = "ten"
+    config["plan"]["epochs"] = "ten"
     saved.write_text(yaml.safe_dump(config))
     capsys.readouterr()
     assert main(["config", "validate", str(saved)]) == 1
     told = capsys.readouterr().out.splitlines()
     assert told == [
         "optimizer: missing. Every configuration that is trained has it.",
-        "plan.t_start: expected a whole number, got null.",
-        "plan.tmax: unknown key of gausim.plan.Curriculum. Did you mean 't_max'?",
         "model.simulator.hierarchy.levels.0.diameter: expected a number, got 'wide'.",
         "model.simulator.template.mode: unknown key of gausim.models.template.elastic.ElasticTemplate. "
         "Did you mean 'modes'?",
         "optimiser: unknown key. Did you mean 'optimizer'?",
+        "plan.epochs: expected a whole number or null, got 'ten'.",
+        "plan.tmax: unknown key of gausim.training.plan.TrainingPlan. Did you mean 't_max'?",
         "sweep.retry: unknown key. Known: retry_failed.",
-        "plan.epochs: expected a whole number, got 'ten'.",
     ]
 
 

@@ -48,7 +48,7 @@ class LinearTracks(AnchoredMotion):
         super().__init__(anchors=anchors, **recorded)
         if min(neighbours, basis, modes) < 1 or self.seen < 2:
             raise ConfigError(
-                "model.method: expected neighbours, basis, modes >= 1 and data.curriculum.t_max >= 2, got "
+                "model.method: expected neighbours, basis, modes >= 1 and plan.t_max >= 2, got "
                 f"{neighbours}, {basis}, {modes} and {self.seen}."
             )
         self.modes, self.velocity = modes, nn.ParameterList()

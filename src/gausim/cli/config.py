@@ -15,7 +15,7 @@ SHELLS = ("bash", "zsh", "fish")
 VALIDATE = """Composes a configuration and checks it without training: unknown keys (with the nearest known one), values
 of the wrong kind, targets that may not be built, what the constructors refuse. Exits with 1 if something is wrong.
 
-  gausim config validate experiment=bunny trainer.max_epochs=90    as `gausim train` would be given
+  gausim config validate experiment=bunny plan.epochs=90    as `gausim train` would be given
   gausim config validate bunny                                     an experiment of conf/
   gausim config validate MINE/experiment/a.yaml                    of `gausim train --config-dir MINE experiment=a`
   gausim config validate outputs/bunny/seed_0                      what a run was trained with

@@ -152,7 +152,7 @@ def _fit(
 ) -> float | None:
     module, datamodule = parts
     plan = module.method.plan if isinstance(module.method, StagedFit) else None
-    trainer = _trainer(cfg, run, crew, epochs=module.plan.epochs or 1)
+    trainer = _trainer(cfg, run, crew, epochs=(module.plan.epochs or 1) if plan is None else plan.epochs)
     faults: list[str] = []
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
@@ -181,7 +181,7 @@ def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:
     if isinstance(module.method, StagedFit):
         facts["notes"] = module.notes()
     rows = Table(Path(trainer.default_root_dir) / EPOCHS, "epoch").rows()
-    full = [row for row in rows if row.get("excess_static") and row["steps"] == rows[-1]["steps"]]
+    full = [row for row in rows if row.get("excess_static") and row["steps"] == rows[-1]["steps"]]  # of the largest T
     falls = still_falls([float(row["excess_static"]) for row in full])
     return facts | ({} if falls is None else {"still_falls": falls})
 

@@ -82,7 +82,7 @@ def open_scene(
     require_pinned(scene)
     torch.manual_seed(seed)
     if base is None:
-        model = _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
+        model = _built(compose("train", [f"model={UNTRAINED}"]).model.simulator, scene, fps)
     else:
         model = _of_base(scene, fps, base)
     if material is None and base is not None:

@@ -92,7 +92,7 @@ class Sequences(nn.Module):
 class StagedFit(Method):
     """A method with parameters for every sequence, fitted stage by stage.
 
-    With ``data.batch_size`` 1 the fits of the sequences are independent (loss gradients are clipped per sequence),
+    With ``plan.batch_size`` 1 the fits of the sequences are independent (loss gradients are clipped per sequence),
     except for parameters of the whole object. The stages of the ``plan`` set T of the ``curriculum``; a rollout ends
     where a kernel is further than ``explosion`` from rest [diagonals of the scene].
     """
