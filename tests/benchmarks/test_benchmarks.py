@@ -23,9 +23,9 @@ from gausim.models.initial_state import ModalInitialStates
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.render.reference import ReferenceRenderer
-from gausim.training.plan import TrainingPlan
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
+from gausim.training.plan import TrainingPlan
 
 QUICK = Options(quick=True, rounds=1)
 
