@@ -17,7 +17,7 @@ from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.compose.places import more_settings
 from gausim.io.ply import load_scene, save_scene
-from gausim.report.pictures import kernels
+from gausim.pictures import kernels
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.report.pictures.figures import diagnosis_figure, diagnosis_plot
+from gausim.pictures.figures import diagnosis_figure, diagnosis_plot
 from gausim.results.curves import TRUTH
 from gausim.results.diagnosis import Diagnosis, read_diagnosis
 

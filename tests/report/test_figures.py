@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from helpers.report_runs import make_curves
 
-from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
-from gausim.report.pictures.frames import Timeline, moving_line, space_time_slice, video_frame
+from gausim.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.pictures.frames import Timeline, moving_line, space_time_slice, video_frame
 
 
 def swinging(frames: int = 12, height: int = 20, width: int = 30) -> np.ndarray:

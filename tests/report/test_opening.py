@@ -15,8 +15,8 @@ import pytest
 from helpers.report_runs import config, evaluate, make_curves, page_of, study_of, write_run
 
 from gausim.io.video import read_video
+from gausim.pictures.frames import SEEN
 from gausim.report.opening import MOST_OPENINGS, MOST_ROWS, make_openings
-from gausim.report.pictures.frames import SEEN
 from gausim.report.tables.verdict import outcome, sentences
 from gausim.results.curves import ImageMetricInfo
 

@@ -11,7 +11,7 @@ from helpers.report_runs import config, evaluate, make_curves, make_pictures, pa
 
 from gausim.core import RunError
 from gausim.io.video import read_video
-from gausim.report.pictures.media import Exhibit, object_figures
+from gausim.report.media import Exhibit, object_figures
 from gausim.results.pictures import load_pictures, save_pictures
 
 

@@ -20,7 +20,7 @@ from gausim.data.objects import ObjectData
 from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.metrics import FLIP
-from gausim.report.pictures.figures import diagnosis_figure, endurance_figure, error_figure
+from gausim.pictures.figures import diagnosis_figure, endurance_figure, error_figure
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
 from gausim.runs.directory import RunDirectory

@@ -113,7 +113,7 @@ def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
 
 
 def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namespace, out: Path) -> None:
-    from gausim.report.pictures.kernels import draw_clusters
+    from gausim.pictures.kernels import draw_clusters
 
     above = range(1, len(hierarchy.levels))
     upward = arguments.up or _away_from_pins(arguments)

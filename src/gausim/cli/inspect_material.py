@@ -18,8 +18,8 @@ from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Property
 from gausim.ops.orbit import orbit_cameras
 from gausim.ops.spherical_harmonics import C0
+from gausim.pictures.kernels import draw_property, property_colors, property_scale
 from gausim.render.draw import draw_still
-from gausim.report.pictures.kernels import draw_property, property_colors, property_scale
 
 PIXELS = 480
 

@@ -226,8 +226,8 @@ def _fit(
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
     """Draws truth, rendering and four times the difference (rows) of held-out and then training stills (columns)."""
     from gausim.data.images import composite
+    from gausim.pictures.figures import picture_grid
     from gausim.render.draw import draw_still, to_bytes
-    from gausim.report.pictures.figures import picture_grid
 
     size = sets[0].cameras.width, sets[0].cameras.height
     alike = [s for s in sets if (s.cameras.width, s.cameras.height) == size]

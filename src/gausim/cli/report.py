@@ -55,7 +55,7 @@ def _write_page(target: Path) -> int:
 
 def _draw_bodies(dirs: list[Path], target: Path) -> int:
     """Draws the errors of fits to bodies held out of a corpus, and prints them."""
-    from gausim.report.pictures.bodies import bodies_figure, fitted_errors
+    from gausim.report.bodies import bodies_figure, fitted_errors
 
     errors = fitted_errors(dirs)
     bodies_figure(errors, target)

@@ -32,9 +32,9 @@ from gausim.io.ply import load_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import write_gif, write_video
 from gausim.ops.orbit import orbit_cameras
+from gausim.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
 from gausim.render.draw import film, to_bytes
-from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
-from gausim.report.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
 from gausim.results.summary import summarise
 
 # Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].

@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 
 from gausim.doctor.clock import motion_energy
 from gausim.doctor.evidence import Evidence
-from gausim.report.pictures.figures import METHOD_COLORS, literal, save_figure
+from gausim.pictures.figures import METHOD_COLORS, literal, made_figure, save_figure
 from gausim.runs.bar import with_bar
 
-_DPI = 110
 _COLUMNS = 3
 # Background behind the cut-out object, on which dark objects are visible.
 _BEHIND = 90
@@ -35,8 +34,8 @@ def _views(evidence: Evidence) -> Figure:
     item = evidence.first[0]
     count, (height, width) = len(evidence.views), item.alpha.shape[-2:]
     rows = -(-count // _COLUMNS)
-    figure = Figure(figsize=(3.4 * _COLUMNS, rows * (3.4 * height / width + 0.4)), dpi=_DPI, layout="constrained")
-    for v, axes in enumerate(np.ravel(figure.subplots(rows, _COLUMNS, squeeze=False))):
+    figure, places = made_figure(rows, _COLUMNS, (3.4 * _COLUMNS, rows * (3.4 * height / width + 0.4)))
+    for v, axes in enumerate(places):
         axes.set_axis_off()
         if v >= count:
             continue
@@ -54,8 +53,7 @@ def _views(evidence: Evidence) -> Figure:
 
 def _motion(evidence: Evidence) -> Figure:
     count = len(evidence.watched)
-    figure = Figure(figsize=(9.0, 1.9 * count + 0.4), dpi=_DPI, layout="constrained")
-    panels = np.ravel(figure.subplots(count, 1, sharex=True, squeeze=False))
+    figure, panels = made_figure(count, 1, (9.0, 1.9 * count + 0.4))
     for axes, item in zip(panels, evidence.watched, strict=True):
         energy = motion_energy(item)
         for v, view in enumerate(evidence.views):

@@ -13,7 +13,7 @@ from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
 from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
 from gausim.report.gather.study import Group, Study, cell, pooled
-from gausim.report.pictures.media import Film, make_film
+from gausim.report.media import Film, make_film
 from gausim.report.tables.sheets import NOTHING
 from gausim.report.tables.verdict import NAMES, outcome, sentences
 from gausim.results.curves import ERROR_3D, STATIC

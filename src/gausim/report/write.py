@@ -14,11 +14,11 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from gausim.io.files import write_durably
+from gausim.pictures.frames import FORESEEN, SEEN
 from gausim.report.gather.runs import RunRecord, find_runs
 from gausim.report.gather.study import Group, Study, cell, counted, make_study, reference_rows
+from gausim.report.media import object_figures
 from gausim.report.opening import Opening, make_openings, unanswered
-from gausim.report.pictures.frames import FORESEEN, SEEN
-from gausim.report.pictures.media import object_figures
 from gausim.report.records.measure import measured_record
 from gausim.report.records.print import results_latex, results_page
 from gausim.report.records.record import Record

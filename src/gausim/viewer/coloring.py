@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -15,8 +13,8 @@ from gausim.core import GaussianScene, SteppedFrame
 from gausim.models.template.template import Property
 from gausim.ops.covariance import transport_covariance
 from gausim.ops.spherical_harmonics import C0
+from gausim.pictures.kernels import scale_colors, unit_colors
 from gausim.render.draw import SceneAppearance, deformed_appearance
-from gausim.report.pictures.kernels import unit_colors
 
 VIEW, BASE, STRAIN, SPEED, MASS = (
     "As seen from the camera (SH)", "Base colour (DC)", "Strain", "Velocity", "Mass",
@@ -104,12 +102,13 @@ class Painter:
     def _logarithmic(self, value: Tensor, known: Tensor, text: str) -> tuple[Tensor, Legend]:
         logarithm = value.nan_to_num().clamp_min(1e-12).log10()
         low, high = float(logarithm[known].min()), float(logarithm[known].max())
-        return _ramp((logarithm - low) / max(high - low, 1e-6)), Legend(f"{text}, logarithm to base 10", low, high)
+        colors = scale_colors((logarithm - low) / max(high - low, 1e-6))
+        return colors, Legend(f"{text}, logarithm to base 10", low, high)
 
     def _scaled(self, mode: str, value: Tensor, text: str, unit: str) -> tuple[Tensor, Legend]:
         value = torch.where(self._moving, value, torch.zeros_like(value))
         self._highest[mode] = high = max(self._highest.get(mode, 1e-3), float(value.max()))
-        return _ramp(value / high), Legend(f"{text} (scale: largest so far)", 0.0, high, unit)
+        return scale_colors(value / high), Legend(f"{text} (scale: largest so far)", 0.0, high, unit)
 
 
 def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: Bool[Tensor, " K"]) -> Tensor:
@@ -125,19 +124,7 @@ def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
     return torch.where(units[:, None] < 0, 0.5, torch.from_numpy(unit_colors(units.numpy())).float())
 
 
-def _ramp(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:
-    table = torch.from_numpy(_table())
-    return table[(fraction.clamp(0, 1) * (len(table) - 1)).round().long()]
-
-
-@cache
-def _table() -> np.ndarray:
-    from matplotlib import colormaps
-
-    return np.asarray(colormaps["turbo"](np.linspace(0.02, 0.98, 256))[:, :3], np.float32)
-
-
 def gradient_css() -> str:
     """The scale as a CSS gradient, for the legend."""
-    stops = [",".join(str(int(255 * v)) for v in _table()[i]) for i in range(0, 256, 51)]
-    return "linear-gradient(to right," + ",".join(f"rgb({stop})" for stop in stops) + ")"
+    colors = (255 * scale_colors(torch.linspace(0, 1, 6))).int().tolist()
+    return "linear-gradient(to right," + ",".join(f"rgb({r},{g},{b})" for r, g, b in colors) + ")"

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from gausim.io.video import write_video
-from gausim.report.pictures.frames import Timeline, error_colors, label_bar, moving_line, space_time_slice, video_frame
+from gausim.pictures.frames import Timeline, error_colors, label_bar, moving_line, space_time_slice, video_frame
 
 FOLDER = "panels"
 # Largest number of rows of images, which are shrunk to it, and smallest of videos, which are enlarged [pixels].

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter
 
 from gausim.io.files import replacing
-from gausim.report.pictures.frames import error_colors, moving_line, space_time_slice
+from gausim.pictures.frames import error_colors, moving_line, space_time_slice
 from gausim.results.curves import ERROR_3D, TRUTH, ObjectCurves
 from gausim.results.diagnosis import DiagnosisFigures, numbers, read_diagnosis
 

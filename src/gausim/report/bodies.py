@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 
 from gausim.core.errors import RunError
-from gausim.report.pictures.figures import METHOD_COLORS, made_figure, save_figure
+from gausim.pictures.figures import METHOD_COLORS, made_figure, save_figure
 
 FILE = "corpus.json"
 

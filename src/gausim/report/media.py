@@ -17,10 +17,8 @@ from matplotlib.figure import Figure
 
 from gausim.core import GausSimError, RunError
 from gausim.io.video import SMALL, write_video
-from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import Study
-from gausim.report.pictures.figures import diagnosis_plot, error_plot, literal, panels_plot, slices_plot
-from gausim.report.pictures.frames import (
+from gausim.pictures.figures import diagnosis_plot, error_plot, literal, panels_plot, slices_plot
+from gausim.pictures.frames import (
     ERROR_RANGE,
     Timeline,
     brighten,
@@ -30,6 +28,8 @@ from gausim.report.pictures.frames import (
     time_line,
     timeline_bar,
 )
+from gausim.report.gather.runs import RunRecord
+from gausim.report.gather.study import Study
 from gausim.results.curves import ObjectCurves, load_curves
 from gausim.results.diagnosis import read_diagnosis
 from gausim.results.pictures import Pictures, kept_pictures

@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, hsv_to_rgb
 from torch import Tensor
 
-from gausim.report.pictures.figures import made_figure, save_figure
+from gausim.pictures.figures import made_figure, save_figure
 
 # Distance of successive units' hues on the colour circle: multiples of the golden ratio never repeat.
 GOLDEN = 0.6180339887498949
@@ -81,8 +81,13 @@ def property_scale(values: Float[Tensor, " K"]) -> LogNorm:
 def property_colors(values: Float[Tensor, " K"], scale: LogNorm) -> Float[Tensor, "K 3"]:
     """Colours of the kernels; grey where the value is not known (NaN)."""
     known = torch.isfinite(values)
-    found = np.asarray(colormaps["turbo"](scale(torch.where(known, values, 1.0).numpy())))[:, :3]
-    return torch.where(known[:, None], torch.from_numpy(found.astype(np.float32)), torch.tensor(_UNKNOWN))
+    fraction = torch.from_numpy(np.asarray(scale(torch.where(known, values, 1.0).numpy()), np.float32))
+    return torch.where(known[:, None], scale_colors(fraction), torch.tensor(_UNKNOWN))
+
+
+def scale_colors(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:
+    """Colours of the scale (turbo) for fractions in [0, 1]."""
+    return torch.from_numpy(np.asarray(colormaps["turbo"](fraction.clamp(0, 1).numpy())[:, :3], np.float32))
 
 
 def draw_property(path: Path, images: Float[np.ndarray, "V H W 3"], scale: LogNorm, *, title: str, text: str) -> None:
