@@ -26,8 +26,7 @@ import torch
 import gausim.cli.training_run
 import gausim.compose.build
 import gausim.training.callbacks.panels
-import gausim.training.loggers.files
-import gausim.training.loggers.wandb  # noqa: F401
+import gausim.training.dashboards  # noqa: F401
 from gausim.cli.main import main
 from gausim.training.module import GausSimModule
 

@@ -16,7 +16,6 @@ from lightning.pytorch import LightningModule, Trainer
 from gausim.runs.cost import TrainingCost
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.callbacks.resume import RunCheckpoint
-from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
 
 MODULE = LightningModule()
 
@@ -37,26 +36,6 @@ def test_random_generators_go_on_where_they_were(tmp_path: Path) -> None:
         assert draws() == expected
     finally:
         restore_random_state(outside)
-
-
-def test_the_log_forgets_later_steps_and_grows(tmp_path: Path) -> None:
-    first = CsvLog(tmp_path)
-    first.resume_at(0)
-    for step in (1, 2, 3, 4):
-        first.log_metrics({"loss": step / 3}, step=step)
-    first.log_metrics({"extra": 7.0}, step=4)
-    with first.table.path.open("a") as file:
-        file.write("5,0.")
-    second = CsvLog(tmp_path)
-    second.resume_at(3)
-    second.log_metrics({"loss": 0.5, "late": 1.0}, step=4)
-    lines = second.table.path.read_text().splitlines()
-    assert lines[0] == "step,loss,extra,late" and len(lines) == 5
-    assert lines[3] == f"3,{3 / 3},," and lines[4] == "4,0.5,,1.0"
-    third = CsvLog(tmp_path)
-    third.resume_at(0)  # a run that begins anew
-    assert third.table.path.read_text().splitlines() == ["step"]
-    assert isinstance(third, Resumable) and isinstance(TensorBoardLog(tmp_path), Resumable)
 
 
 def trainer_at(step: int, *, epoch: int = 0, last: bool = False, folder: Path = Path()) -> Any:

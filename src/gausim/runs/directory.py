@@ -24,14 +24,12 @@ from gausim.runs.comparison import changed_keys
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
 
-from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
-
 LOCK, EVENTS = ".lock", "events.jsonl"
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # Files that `overwrite` removes; gausim made no others in the directory.
 OWN_FILES = (
     CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS,
-    MOTION, WANDB_ID, MLFLOW_ID,
+    MOTION,
 )  # fmt: skip
 OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 

@@ -6,4 +6,3 @@ EVALUATION = "evaluation/metrics.json"
 TEST = "evaluation/test.json"  # looks at the test part
 EPOCHS = "epochs.csv"  # one row per epoch
 MOTION = "motion.csv"  # statistics of the predicted motion, every few epochs
-MLFLOW_ID, WANDB_ID = "mlflow_id", "wandb_id"  # ids of the run on dashboards, which a resumed run continues

@@ -19,7 +19,8 @@ from gausim.metrics.image import L2
 from gausim.render.draw import to_bytes
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data
-from gausim.training.loggers.media import Clip, MediaLog, forget_media, safe_name, write_media
+from gausim.training.dashboards import log_media
+from gausim.training.media import Clip, forget_media, safe_name, write_media
 from gausim.training.module import GausSimModule
 
 COLUMNS = ["object", "sequence", "camera", "T", "l2 x1000", "static x1000", "l2 / static", "motion energy", "seconds"]
@@ -76,8 +77,7 @@ class Panels(Callback):
         media = write_media(Path(trainer.default_root_dir), trainer.global_step, clips, COLUMNS, rows)
         for logger in trainer.loggers:
             logger.log_metrics(numbers, step=trainer.global_step)
-            if isinstance(logger, MediaLog):
-                logger.log_media(media)
+            log_media(logger, media)
 
     def _samples(self, trainer: Trainer, module: GausSimModule) -> list[SequenceSample]:
         data = training_data(trainer)

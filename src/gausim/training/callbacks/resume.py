@@ -15,7 +15,6 @@ from gausim.core import ConfigError
 from gausim.runs.checkpoint import LAST_CHECKPOINT, digest
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.callbacks.cadence import has_come
-from gausim.training.loggers.files import Resumable
 from gausim.training.ranks.ranks import Ranks
 
 
@@ -64,13 +63,13 @@ class RunCheckpoint(Checkpoint):
 
     def _save(self, trainer: Trainer) -> None:
         for logger in trainer.loggers:
-            logger.save()  # a resumed run does not log rows up to this step again
+            logger.save()  # a kill loses no rows up to this step
         trainer.save_checkpoint(Path(trainer.default_root_dir) / LAST_CHECKPOINT, weights_only=False)
         self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
 
 
 class ExactResume(Callback):
-    """Restores the state that Lightning does not: random generators, loggers' rows and the end of a finished run.
+    """Restores the state that Lightning does not: random generators and the end of a finished run.
 
     Since nothing is lost but what follows the last checkpoint, SIGTERM ends a run at once. Lightning would wait for the
     end of an update, and a warm start takes minutes.
@@ -102,11 +101,8 @@ class ExactResume(Callback):
             trainer.should_stop = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restores the generators, removes logged steps that will be repeated, and gives SIGTERM its usual effect."""
+        """Restores the generators, and gives SIGTERM its usual effect."""
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
         if self._random is not None:
             restore_random_state(self._random)
-        for logger in trainer.loggers:
-            if isinstance(logger, Resumable):
-                logger.resume_at(trainer.global_step)

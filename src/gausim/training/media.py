@@ -1,4 +1,4 @@
-"""Media of training for dashboards: videos, pictures and tables, as files of the run."""
+"""Media of training: videos, pictures and tables, as files of the run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -54,15 +53,6 @@ class Media:
     def objects(self) -> tuple[list[str], list[list[str]]]:
         """Columns and rows of the table with a line per object."""
         return _read_table(self.folder / "objects.csv")
-
-
-@runtime_checkable
-class MediaLog(Protocol):
-    """A logger for media; the CSV table is none."""
-
-    def log_media(self, media: Media) -> None:
-        """Logs the media of one step."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
