@@ -24,7 +24,6 @@ from gausim.data.objects import ObjectData
 from gausim.interaction.selections import Ball
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
-from gausim.io.motion import load_motion, save_motion
 from gausim.io.npz import read_array
 from gausim.io.ply import load_masks, load_scene
 from gausim.io.trajectory import load_trajectory, save_trajectory
@@ -50,7 +49,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": read_checkpoint, "config.yaml": lambda path: RunDirectory(path.parent).config(),
     "metrics.npz": load_curves, "pictures.npz": load_pictures, "metrics.json": load_summary, "lpips.safetensors": LPIPS,
     "ground_truth.npz": lambda path: read_array(path, "payload"), "transforms.json": read_transforms,
-    "scene.ply": load_scene, "scene.masks.npz": lambda path: load_masks(SCENE, path), "m.motion.glb": load_motion,
+    "scene.ply": load_scene, "scene.masks.npz": lambda path: load_masks(SCENE, path),
     "trajectory.safetensors": load_trajectory, "dataset.json": whole, "session.json": load_session,
 }  # fmt: skip
 
@@ -87,12 +86,11 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Callable[[Path]
     toy = toy_object.write_toy_object(root / "toy", frames=8)
     pack(toy.root, root / "store")
     truth = toy.truth("seq_000", 3)
-    save_motion(root / "m.motion.glb", SCENE, truth)
     save_trajectory(root / "trajectory.safetensors", truth)
     push = Force(on=Ball((0.0, 0.0, 1.0), 0.2), direction=(1.0, 0.0, 0.0), weights=2.0, frames=3)
     made = MadeWith("toy", "0" * 64, "1" * 64, "2" * 64)
     save_session(ForceSession(made, 24.0, 8, (Entry(1, push), Entry(6, Reset())), 9.81), root / "session.json")
-    found = {root / name: READERS[name] for name in ("m.motion.glb", "trajectory.safetensors", "session.json")}
+    found = {root / name: READERS[name] for name in ("trajectory.safetensors", "session.json")}
     found |= {toy.root / "scene.ply": load_scene, toy.root / "scene.masks.npz": READERS["scene.masks.npz"]}
     inside = ("dataset.json", "sequences/seq_000/transforms.json", "sequences/seq_000/ground_truth.npz")
     found |= {toy.root / name: whole for name in inside}

@@ -50,8 +50,8 @@ def _parser() -> argparse.ArgumentParser:
         rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
     parser = command_parser("export", epilog="formats:\n" + "\n".join(rows))
     add = parser.add_argument
-    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a .motion.glb; "
-        "or a folder of name_0001.ply, ...")  # fmt: skip
+    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); or a folder of "
+        "name_0001.ply, ...")  # fmt: skip
     add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
     add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply and gltf); default NAME.SUFFIX here")
     add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
@@ -73,7 +73,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _opened(arguments: argparse.Namespace) -> Motion:
-    from gausim.io.motion import load_motion
     from gausim.io.ply_sequence import load_ply_sequence
 
     source: Path = arguments.source
@@ -82,9 +81,6 @@ def _opened(arguments: argparse.Namespace) -> Motion:
         return Motion(source.name, fps, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
     if source.suffix == ".safetensors":
         return _from_trajectory(source, arguments.scene)
-    if source.suffix == ".glb":
-        scene, trajectory = load_motion(source)
-        return _of_trajectory(scene.name, scene, trajectory)
     return _from_run(arguments)
 
 
@@ -161,7 +157,7 @@ def _write(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
     if trajectory is None:
         raise ConfigError(
             f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
-            "Export from a run, a trajectory or a motion, or as ply, gltf, usd, mp4 or gif."
+            "Export from a run or a trajectory, or as ply, gltf, usd, mp4 or gif."
         )
     match arguments.format:
         case "safetensors":
@@ -239,7 +235,7 @@ FORMATS = {
         "hundredth of the size of PLY files",
         "digits (errors below a thousandth of the diagonal; spherical harmonics have 8 bits); rotations become those "
         "of the deformation gradients",
-        "gausim; the rest scene by every reader of glTF's KHR_gaussian_splatting",
+        "the page of --format html; the rest scene by every reader of glTF's KHR_gaussian_splatting",
     ),
     "html": Format(
         ".html",
@@ -259,7 +255,7 @@ FORMATS = {
         "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
         "spherical harmonics, float32",
         "masks, units, deformation gradients",
-        "gausim, OpenUSD 26.3 or newer",
+        "OpenUSD 26.3 or newer",
     ),
     "viser": Format(
         ".viser",

@@ -8,58 +8,24 @@ motion is in ``extras.gausim_motion``, see docs/reference/files.md for the layou
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from msgspec import Meta, Struct
 from torch import Tensor
 
-from gausim.core import DataError, DivergenceError, GaussianScene, SceneError, Trajectory
-from gausim.core.scene import SH_COEFFICIENTS
+from gausim.core import DataError, DivergenceError, GaussianScene, Trajectory
 from gausim.io.files import write_durably
-from gausim.io.gltf import Glb, read_glb, splat_glb, splat_scene
-from gausim.io.plain_json import checked
+from gausim.io.gltf import Glb, splat_glb
 
-KEY, VERSION, SUFFIX = "gausim_motion", 1, ".motion.glb"
+KEY, VERSION = "gausim_motion", 1
 # Kernels that leave the motion of their unit by more than this get a unit of their own [diagonals].
 _FOLLOWS = 2e-4
 # Levels of the stored spherical harmonics above degree 0, each way.
 _LEVELS = 127
 _MASKS = ("simulated", "pinned", "foreground")
-_MOST_MEMORY = 8 << 30  # positions of all kernels and frames [bytes]
-_REMEDY = "Export it again with `gausim export --format motion`."
-
-_Count = Annotated[int, Meta(ge=1, le=1 << 31)]
-_Size = Annotated[float, Meta(gt=0, le=1e30)]
-
-
-class _Views(Struct, forbid_unknown_fields=True):
-    """Indices of the buffer views."""
-
-    rest_centres: int
-    origins: int
-    units: int
-    unit_of_kernel: int
-    masks: int
-    sh: int
-
-
-class _Facts(Struct, forbid_unknown_fields=True):
-    """Facts of a motion, beside its arrays."""
-
-    version: Literal[1]
-    fps: _Size
-    frames: _Count
-    units: _Count
-    diagonal: _Size  # unit of the stored lengths [scene units]
-    volume_scale: _Size
-    sh_scales: list[Annotated[float, Meta(ge=0, le=1e30)]]  # of every coefficient above degree 0
-    views: _Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +65,6 @@ class UnitMotion:
         for moved, gradients in zip(self.displacements, self.deformation_gradients - torch.eye(3), strict=True):
             yield rest + moved[unit] + (gradients[unit] @ offset)[..., 0]
 
-    def trajectory(self, rest: Float[Tensor, "K 3"], fps: float) -> Trajectory:
-        """The motion of all kernels; Q is the rotation of the polar decomposition of G."""
-        left, _, right = torch.linalg.svd(self.deformation_gradients)
-        left[..., 2] *= torch.linalg.det(left @ right)[..., None]
-        positions = torch.stack(list(self.positions(rest)))
-        return Trajectory(positions, self.deformation_gradients, left @ right, self.unit_of_kernel, fps)
-
 
 def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> Glb:
     """The document of a motion, see :func:`save_motion`."""
@@ -124,18 +83,20 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
     high = scene.sh[:, 1:].detach().cpu().float()
     scales = high.abs().amax((0, 2)) / _LEVELS
     levels = (high / scales.clamp_min(1e-30)[:, None]).round()
-    views = _Views(
-        rest_centres=glb.add_view(motion.rest_centres.numpy().astype("<f4")),
-        origins=glb.add_view(origins.numpy().astype("<f4")),
-        units=glb.add_view(units),
-        unit_of_kernel=glb.add_view(motion.unit_of_kernel.numpy().astype("<u2" if count <= 1 << 16 else "<u4")),
-        masks=glb.add_view(np.asarray(masks, np.uint8)),
-        sh=glb.add_view(levels.numpy().astype(np.int8)),
-    )
-    facts = _Facts(
-        1, trajectory.fps, trajectory.frames, count, scene.diagonal, scene.volume_scale, scales.tolist(), views
-    )
-    glb.document["extras"] = {KEY: msgspec.to_builtins(facts)}
+    views = {
+        "rest_centres": motion.rest_centres.numpy().astype("<f4"),
+        "origins": origins.numpy().astype("<f4"),
+        "units": units,
+        "unit_of_kernel": motion.unit_of_kernel.numpy().astype("<u2" if count <= 1 << 16 else "<u4"),
+        "masks": np.asarray(masks, np.uint8),
+        "sh": levels.numpy().astype(np.int8),
+    }
+    facts = {
+        "version": VERSION, "fps": trajectory.fps, "frames": trajectory.frames, "units": count,
+        "diagonal": scene.diagonal, "volume_scale": scene.volume_scale, "sh_scales": scales.tolist(),
+    }  # fmt: skip
+    indices = {name: glb.add_view(array) for name, array in views.items()}
+    glb.document["extras"] = {KEY: {**facts, "views": indices}}
     return glb
 
 
@@ -143,93 +104,13 @@ def save_motion(path: Path | str, scene: GaussianScene, trajectory: Trajectory, 
     """Writes a rest scene and its motion; replaces the file atomically. ``up`` (y or z) is for readers of glTF.
 
     Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre
-    and deformation gradient with 11 significant bits. Lost: rotations, which on reading are those of the
-    deformation gradients.
+    and deformation gradient with 11 significant bits. Lost: rotations, which are those of the deformation gradients.
 
     Raises:
         DataError: the trajectory is of another scene, or goes beyond half floats or the size of a GLB.
         DivergenceError: a frame is not finite.
     """
     write_durably(Path(path), motion_glb(scene, trajectory, up=up).to_bytes())
-
-
-def load_motion(path: Path | str) -> tuple[GaussianScene, Trajectory]:
-    """Reads a rest scene and its motion.
-
-    Raises:
-        DataError: the file is missing, damaged, has no motion, or one of another version; names the field.
-    """
-    path = Path(path)
-    glb = read_glb(path)
-    facts = _facts(glb)
-    scene = _scene(glb, facts, path)
-    views, frames, units = facts.views, facts.frames, facts.units
-    needs = frames * scene.count * 12
-    if needs > _MOST_MEMORY:
-        raise DataError(
-            f"{path}: {frames} frames of {scene.count} kernels take {needs / 2**30:.1f} GiB, expected at most "
-            f"{_MOST_MEMORY >> 30}. Export fewer frames (--every)."
-        )
-    rest = _array(glb, views.rest_centres, "rest_centres", "<f4", (units, 3)).copy()
-    origins = _array(glb, views.origins, "origins", "<f4", (frames, 3))
-    moved = _array(glb, views.units, "units", "<f2", (frames, units, 12)).astype(np.float32)
-    kind = "<u2" if units <= 1 << 16 else "<u4"
-    index = _array(glb, views.unit_of_kernel, "unit_of_kernel", kind, (scene.count,)).astype(np.int64)
-    if index.max() >= units:
-        raise DataError(f"{path}: field 'unit_of_kernel': expected indices of {units} units. {_REMEDY}")
-    gradients = np.eye(3, dtype=np.float32) + moved[..., 3:].reshape(frames, units, 3, 3)
-    with np.errstate(over="ignore", invalid="ignore"):
-        shifts = origins[:, None] + np.float32(facts.diagonal) * moved[..., :3]
-    motion = UnitMotion(*(torch.from_numpy(np.ascontiguousarray(x)) for x in (rest, shifts, gradients, index)))
-    trajectory = motion.trajectory(scene.means, facts.fps)
-    if not torch.isfinite(trajectory.positions).all():
-        raise DataError(f"{path}: fields 'units' and 'diagonal' give positions beyond float32. {_REMEDY}")
-    return scene, trajectory
-
-
-def _facts(glb: Glb) -> _Facts:
-    extras = glb.document.get("extras")
-    plain = extras.get(KEY) if isinstance(extras, dict) else None
-    if plain is None:
-        raise DataError(f"{glb.source}: has no 'extras.{KEY}', so it holds no motion of gausim. {_REMEDY}")
-    version = plain.get("version") if isinstance(plain, dict) else None
-    if version != VERSION:
-        raise DataError(
-            f"{glb.source}: field 'version': expected {VERSION}, got {str(version)[:40]}. Read it with the gausim that "
-            "wrote it, or update gausim."
-        )
-    return checked(plain, _Facts, f"{glb.source}: extras.{KEY}", _REMEDY)
-
-
-def _scene(glb: Glb, facts: _Facts, path: Path) -> GaussianScene:
-    scene = splat_scene(glb, path.name.removesuffix(SUFFIX))
-    count, above = scene.count, len(facts.sh_scales)
-    if above + 1 not in SH_COEFFICIENTS.values() or scene.sh.shape[1] != 1:
-        raise DataError(f"{path}: field 'sh_scales': expected 0, 3, 8 or 15 numbers, got {above}. {_REMEDY}")
-    levels = _array(glb, facts.views.sh, "sh", "i1", (count, above, 3)).astype(np.float32)
-    high = torch.from_numpy(levels * np.asarray(facts.sh_scales, np.float32)[:, None])
-    bits = torch.from_numpy(_array(glb, facts.views.masks, "masks", "u1", (count,)).astype(np.int64))
-    masks: dict[str, Any] = {name: (bits >> bit & 1).bool() for bit, name in enumerate(_MASKS)}
-    try:
-        return replace(
-            scene, sh=torch.cat((scene.sh, high), 1), volume_scale=facts.volume_scale, **masks
-        ).validated()  # fmt: skip
-    except SceneError as error:
-        raise DataError(f"{path}: {error} {_REMEDY}") from error
-
-
-def _array(glb: Glb, index: int, name: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The numbers of a buffer view, finite."""
-    data, dtype = glb.view(index, name), np.dtype(kind)
-    expected = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if len(data) != expected:
-        raise DataError(
-            f"{glb.source}: field '{name}': expected {expected} bytes for {dtype} {shape}, got {len(data)}. {_REMEDY}"
-        )
-    array = np.frombuffer(data, dtype).reshape(shape)
-    if dtype.kind == "f" and not np.isfinite(array).all():
-        raise DataError(f"{glb.source}: field '{name}' is NaN or infinite. {_REMEDY}")
-    return array
 
 
 def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) -> UnitMotion:
