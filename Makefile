@@ -20,7 +20,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help install test test-slow test-types test-notebooks docs results lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-types test-notebooks docs results lint format data demo train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -70,10 +70,6 @@ data: $(DATA)/.made ## Make the synthetic data set
 $(DATA)/.made: | install
 	$(BIN)/gausim prepare synthesize --out $(DATA)
 	touch $@
-
-dataset: install ## Stages from film to data set, as a file lists them: make dataset CONFIG=object.yaml
-	@test -n "$(CONFIG)" || { echo "error: name what to run: make dataset CONFIG=object.yaml (gausim prepare dataset --help)" >&2; exit 1; }
-	$(BIN)/gausim prepare dataset "$(CONFIG)" $(ARGS)
 
 train: install ## Train: make train ARGS="experiment=demo seed=1"
 	$(BIN)/gausim train $(ARGS)

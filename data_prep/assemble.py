@@ -1,6 +1,6 @@
 """Puts stills, sequences and the scene of one object into one directory, with ``dataset.json``, ready for training.
 
-PICTURES are results of `segment` (or of `poses`, where the pictures had alpha already, or of `import_ready`): posed
+PICTURES are results of `segment` (or of `poses`, where the pictures had alpha already, or of `public`): posed
 stills become OUT/static, posed sequences OUT/sequences. Of several folders the later one replaces what the earlier ones
 have, so that films may be cut out in another way than stills. Without --scene the object is what `reconstruct` needs;
 with the scene of `select` it is complete, and is checked as `gausim verify` does before it takes its name.
@@ -177,4 +177,4 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     lines = described(results["facts"], results["stills"], results["sequences"])
     if results["scene"]:
         return "\n".join([*lines, f"train       {train_command(results['facts']['name'], out)}"])
-    return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])
+    return "\n".join([*lines, f"scene       none yet: gausim reconstruct {out}"])

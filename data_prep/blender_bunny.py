@@ -1,8 +1,8 @@
 """Makes the paper's synthetic set with Blender: an elastic object, set off by pokes and drags, filmed all around.
 
-Any OBJ or PLY mesh will do. Blender's soft body moves it and Cycles renders it, in a Python environment that is created
-at the first run (about 1 GB in the user's cache directory) and is no part of gausim's own. What was interrupted goes on
-picture by picture; the same settings give the same bytes.
+Any OBJ or PLY mesh will do. Blender's soft body moves it and Cycles renders it, in a Python environment of their own
+(where it is missing, the command says how to make it). What was interrupted goes on picture by picture; the same
+settings give the same bytes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from data_prep.blender.environment import BlenderProcess, default_environment, find_blender
+from data_prep.blender.environment import BlenderProcess, default_python, find_blender
 from data_prep.blender.plan import Pictures, Plan, Soft
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
@@ -61,9 +61,13 @@ def main(argv: list[str] | None = None) -> int:
     for kind in (Plan, Pictures, Soft):
         add_options(group, kind, unset=True)
     add = parser.add_argument_group("Blender").add_argument
-    add("--blender-env", type=Path, metavar="DIR",
-        help="its environment, created if missing (default: gausim/blender-VERSION in the user's cache)")  # fmt: skip
-    add("--blender-python", type=Path, metavar="PATH", help="a Python that has bpy, instead")
+    add(
+        "--blender-python",
+        type=Path,
+        default=default_python(),
+        metavar="PATH",
+        help="a Python that has bpy (%(default)s)",
+    )
     add("--workers", type=int, default=cores(), help="processes at a time (%(default)s)")
     return run_command(parser, argv, _run)
 
@@ -74,9 +78,9 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     plan = plan.quick() if arguments.quick else plan
     pictures, soft = replace(plan.pictures, **given(Pictures, arguments)), replace(plan.soft, **given(Soft, arguments))
     plan = replace(plan, **given(Plan, arguments), pictures=pictures, soft=soft)
-    out, folder = arguments.out or Path("data") / plan.name, arguments.blender_env or default_environment()
+    out = arguments.out or Path("data") / plan.name
     manifest = make_set(
-        arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python, folder),
+        arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python),
         workers=max(1, arguments.workers), force=arguments.force, tick=tick,
     )  # fmt: skip
     told = manifest["results"]

@@ -1,9 +1,8 @@
 """Several cameras' films of each sequence to synchronised, lossless frames.
 
-Cameras are put on one clock by their time code, else by their sound, else by a flash that all saw, else by given
-offsets; a camera that ends up more than half a frame from where it should be is refused by name. The output is
-sequences/seq_000/cam_0/0000.png and so on (8-bit RGB), a sheet per sequence to check the synchronisation by eye, and a
-manifest with every camera's facts.
+Cameras are put on one clock by their sound, else by a flash that all saw, else by given offsets; a camera that ends up
+more than half a frame from where it should be is refused by name. The output is sequences/seq_000/cam_0/0000.png and
+so on (8-bit RGB), a sheet per sequence to check the synchronisation by eye, and a manifest with every camera's facts.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from data_prep.capture.films.sheet import write_sheet
 from data_prep.capture.films.sync import METHODS, Alignment, align, facts, measure
 from data_prep.capture.films.takes import Take, find_takes, offset_seconds
 from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
-from data_prep.common.photos import reduced, write_image
+from data_prep.common.photos import reduced, write_picture
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import ConfigError, DataError
@@ -37,12 +36,7 @@ COMPRESSION = 1
 THUMBNAIL = 64
 
 LAYOUT = """FILMS is a folder with one folder per sequence, each with one film per camera, named alike in all sequences;
-or a folder with the films of a single sequence; or a list file, with paths relative to itself:
-
-  {"sequences": [{"name": "poke", "cameras": {"left": "a/1.mp4", "right": "b/7.mov"},
-                  "offsets": {"right": "7.3f"}, "start": 0.5, "duration": 2.0}]}
-
-Cameras become cam_0, cam_1 ... in the natural order of their names."""
+or a folder with the films of a single sequence. Cameras become cam_0, cam_1 ... in the natural order of their names."""
 
 
 def _offsets(text: str) -> dict[str, str]:
@@ -58,16 +52,13 @@ class IngestOptions(Options):
 
     sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=("auto", *METHODS))
     offsets: Mapping[str, str] | None = option(
-        None, "how much later cameras began: seconds, or 7.3f in frames; for sequences that state none",
+        None, "how much later cameras began, in every sequence: seconds, or 7.3f in frames",
         type=_offsets, metavar="CAM=X,CAM=X",
     )  # fmt: skip
     reference: str | None = option(
         None, "camera whose frames give the times (the one with the smallest residuals)", metavar="CAM"
     )
     fps: str | None = option(None, "output rate, of which all cameras' rates are multiples (the slowest camera's)")
-    shutter: float = option(
-        1.0, "exposure as part of the frame interval, for flashes (%(default)s)", least=1e-3, most=1
-    )
     start: float = option(0.0, "leave out so much of the common time [s] (%(default)s)", least=0)
     duration: float | None = option(None, "keep so much of it [s] (all)", least=0)
     max_side: int | None = option(None, "reduce larger pictures to this [pixels]", least=1)
@@ -139,18 +130,15 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:
         given = {}
-        for name, text in (take.offsets or options.offsets or {}).items():
-            camera = _camera(name, take, "offsets")
+        for name, text in (options.offsets or {}).items():
+            camera = take.camera(name, "offsets")
             given[camera] = offset_seconds(text, float(films[camera].rate))
-        offsets = measure(films, options.sync, given=given, shutter=options.shutter)
+        offsets = measure(films, options.sync, given=given)
         alignment = align(
-            films,
-            offsets,
-            rate=Fraction(options.fps) if options.fps else None,
-            reference=_camera(options.reference, take, "reference") if options.reference else None,
-            start=options.start if take.start is None else take.start,
-            duration=options.duration if take.duration is None else take.duration,
-        )
+            films, offsets, rate=Fraction(options.fps) if options.fps else None,
+            reference=take.camera(options.reference, "reference") if options.reference else None,
+            start=options.start, duration=options.duration,
+        )  # fmt: skip
     except DataError as error:
         raise DataError(f"sequence '{take.source}': {error}") from error
     found = {
@@ -163,19 +151,16 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
     return films, alignment, found
 
 
-def _camera(name: str, take: Take, what: str) -> str:
-    """The camera that the user calls so, by the output's name or the film's."""
-    for camera, label in take.labels.items():
-        if name in (camera, label):
-            return camera
-    raise DataError(f"{what}: no camera '{name}'; there are {dict(take.labels)}.")
-
-
 def _warnings(films: Mapping[str, Film]) -> list[str]:
     notes = [
         f"{name}: {film.hdr} footage; its 8-bit frames look flat. Record in standard range."
         for name, film in films.items()
         if film.hdr
+    ]
+    notes += [
+        f"{name}: begins between key frames; its first {film.before_key} frames are left out"
+        for name, film in films.items()
+        if film.before_key
     ]
     sizes = {film.size for film in films.values()}
     return notes if len(sizes) == 1 else [*notes, f"cameras have different sizes: {sorted(sizes)}"]
@@ -190,12 +175,12 @@ def _write_camera(
         places = np.flatnonzero(indices == index)
         if not len(places):
             continue
-        pixels = reduced(cv2.cvtColor(upright(film, frame), cv2.COLOR_RGB2BGR), max_side)
+        pixels = reduced(upright(film, frame), max_side)
         for place in places.tolist():
             path = folder / f"{place:04d}.png"
             if not path.is_file():
-                write_image(path, pixels, COMPRESSION)
-            small[place] = reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), THUMBNAIL)
+                write_picture(path, pixels, COMPRESSION)
+            small[place] = reduced(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), THUMBNAIL)
         done(len(small))
         if len(small) == len(indices):
             break
@@ -207,7 +192,7 @@ def _write_camera(
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = stage_parser("ingest", __doc__, epilog=LAYOUT)
-    parser.add_argument("films", type=Path, metavar="FILMS", help="folder of films, or a list file; see below")
+    parser.add_argument("films", type=Path, metavar="FILMS", help="folder of films; see below")
     add_options(parser.add_argument_group("synchronisation and frames"), IngestOptions)
 
     def run(arguments: argparse.Namespace, tick: Tick) -> str:

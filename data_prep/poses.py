@@ -52,11 +52,9 @@ def find_poses(
     world = world or WorldOptions()
     material = Material.of(sources)
     settings: dict[str, Any] = {"source": sources.kind, "fps": material.fps}
-    settings["world"] = {"up": world.up, "distances": world.distance}
+    settings["world"] = asdict(world)
     if sources.kind == "mapping":
         settings["mapping"] = {k: v for k, v in asdict(mapping).items() if k != "threads"}
-    if sources.kind == "projections":
-        settings["scale"] = sources.scale
     stage = Stage("poses", REVISION, material.inputs, settings, PACKAGES)
     return run_stage(stage, out, lambda work: _make(work, material, mapping, world, tick), force=force)
 
@@ -69,7 +67,7 @@ def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldO
         found, points = material.posed
         results = {"images": len(found), "registered": len(found), "failed": []}
     results["cameras"] = _lenses(found)
-    move, results["world"] = place(found, points, world, mapped=material.posed is None)
+    move, results["world"] = place(found, world, mapped=material.posed is None)
     results["reprojection"] = reprojection(found, points)
     moved = [replace(shot, viewmat=move.viewmat(shot.viewmat)) for shot in found]
     tracks = points.tracks

@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 from data_prep.capture.films.film import probe
+from data_prep.capture.masks.backends import BACKENDS, GROUPS, make_backend
 from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup, cleaned, matte, overlap, steady
-from data_prep.capture.masks.clips import Clip, film_frames, find_clips, is_film, read_picture, write_picture
-from data_prep.capture.masks.options import BACKENDS, GROUPS, make_backend
+from data_prep.capture.masks.clips import Clip, film_frames, find_clips, is_film
 from data_prep.capture.masks.overlays import write_overlays
 from data_prep.capture.masks.segmenters import Backend, MaskOf
 from data_prep.common.command import add_options, chosen, given, headline, run_command, stage_parser
+from data_prep.common.photos import read_picture, write_picture
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import MANIFEST, Stage, copy_missing, read_manifest, run_stage
 from gausim.core.errors import ConfigError, DataError

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from data_prep.common.command import headline, run_command, stage_parser
-from data_prep.common.photos import write_image
+from data_prep.common.photos import write_picture
 from data_prep.common.progress import Tick
 from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import ConfigError
@@ -105,11 +105,11 @@ def draw_masks(path: Path, scene: GaussianScene, *, up: str = "z", size: int = 3
         text = f"{name}: {int(getattr(scene, name).sum())} of {scene.count}"
         cv2.putText(label, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         rows += [label, np.concatenate(list(images), axis=1)]
-    write_image(path, np.concatenate(rows))
+    write_picture(path, np.concatenate(rows))
 
 
 def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
-    """(4, size, size, 3) uint8 BGR of the scene with one mask tinted."""
+    """(4, size, size, 3) uint8 RGB of the scene with one mask tinted."""
     import torch
 
     from gausim.ops.orbit import orbit_cameras
@@ -125,7 +125,7 @@ def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
     flat = replace(scene, sh=((color - 0.5) / C0)[:, None])
     cameras = orbit_cameras(scene.means, azimuths=AZIMUTHS, up=up, size=(size, size))
     drawn = draw_still(CpuRenderer(), flat, cameras, background=torch.ones(3)).rgb[0]
-    return np.ascontiguousarray(to_bytes(drawn).numpy()[..., ::-1])
+    return np.asarray(to_bytes(drawn).numpy())
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -157,12 +157,15 @@ def commands() -> str:
     for name in COMMANDS:
         parts += _help(f"gausim {name}", command(name))
     for name in STAGES:
-        parts += _help(f"gausim prepare {name}", importlib.import_module(f"data_prep.{name}").main)
+        main = importlib.import_module(f"data_prep.{name}").main
+        parts += _help(f"gausim prepare {name}", main)
+        for kind in getattr(sys.modules[main.__module__], "KINDS", ()):
+            parts += _help(f"gausim prepare public {kind}", main, kind)
     return "\n\n".join(parts)
 
 
-def _help(title: str, main: Callable[[list[str]], object]) -> list[str]:
+def _help(title: str, main: Callable[[list[str]], object], *before: str) -> list[str]:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
-        main(["--help"])
+        main([*before, "--help"])
     return [f"## `{title}`", f"```text\n{said.getvalue().rstrip()}\n```"]

@@ -1,16 +1,13 @@
-"""Blender in an environment of its own: created once, found again, and given jobs as a process.
+"""Blender in an environment of its own, given jobs as a process.
 
 Blender's Python package needs Python 3.11 and numpy 1, which gausim does not; so it never is among gausim's packages.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
@@ -19,24 +16,17 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from gausim.core import ConfigError, DataError, GausSimError
-from gausim.io.files import write_durably
+from gausim.core import GausSimError
 
 BPY = "4.5.15"
 REQUIREMENTS = (f"bpy=={BPY}", "numpy<2")
 PYTHON = "3.11"
-# Marker file of an environment, written when it is complete.
-MARKER = "gausim-blender.json"
-INTERPRETER = Path("bin") / "python"
 SCRIPT = Path(__file__).with_name("blender_scene.py")
 TAIL = 12
 
 
 class BlenderError(GausSimError):
-    """Blender cannot be installed or started, or gave up on a job."""
-
-
-Runner = Callable[..., subprocess.CompletedProcess[str]]
+    """Blender cannot be started, or gave up on a job."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +51,7 @@ class BlenderProcess:
             raise BlenderError(f"{self.python}: did not tell its versions. Is this a Python with bpy?") from None
         except BlenderError as error:
             raise BlenderError(
-                f"{error}\n{self.python}: expected a Python with bpy ({', '.join(REQUIREMENTS)}). Leave out "
-                "--blender-python to have one made, or remove the broken --blender-env."
+                f"{error}\n{self.python}: expected a Python with bpy ({', '.join(REQUIREMENTS)})."
             ) from None
         return {name: str(value) for name, value in found.items()}
 
@@ -138,86 +127,22 @@ def _tail(said: Any) -> str:
     return "\n".join(lines[-TAIL:]) or "(it said nothing)"
 
 
-def default_environment() -> Path:
-    """Default directory of the environment, in the user's cache directory."""
+def default_python() -> Path:
+    """Default interpreter: of an environment in the user's cache directory."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache) / "gausim" / f"blender-{BPY}"
+    return Path(cache) / "gausim" / f"blender-{BPY}" / "bin" / "python"
 
 
-def find_blender(python: Path | None, folder: Path, *, run: Runner = subprocess.run) -> BlenderProcess:
-    """Blender of a Python of one's own, or of the environment in ``folder``, which is created where it is missing.
+def find_blender(python: Path) -> BlenderProcess:
+    """Blender of a Python that has bpy.
 
     Raises:
-        BlenderError: the interpreter is not there, or the environment cannot be created.
-        DataError: ``folder`` holds something else.
+        BlenderError: the interpreter is not there; says how to make it.
     """
-    if python is None:
-        return BlenderProcess(create_environment(folder, run=run))
     if not (python.is_file() and os.access(python, os.X_OK)):
-        raise BlenderError(f"--blender-python {python}: expected a Python interpreter that has bpy; no such program.")
-    return BlenderProcess(python.absolute())
-
-
-def create_environment(folder: Path, *, run: Runner = subprocess.run) -> Path:
-    """The interpreter of the environment in ``folder``, after creating it if it is not there yet.
-
-    It is made beside ``folder`` and takes its name when it is complete; a second process waits for the first.
-    """
-    folder = folder.absolute()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with folder.with_name(f".{folder.name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not _is_ready(folder):
-            base = _base_python(run)
-            making = folder.with_name(f".{folder.name}.making")
-            shutil.rmtree(making, ignore_errors=True)
-            told = f"Creating an environment for Blender in {folder} (once; {', '.join(REQUIREMENTS)}, about 1 GB) ..."
-            print(told, file=sys.stderr, flush=True)
-            try:
-                _install(making, base, run)
-                write_durably(making / MARKER, json.dumps({"requirements": list(REQUIREMENTS)}).encode())
-                os.replace(making, folder)
-            finally:
-                shutil.rmtree(making, ignore_errors=True)
-    return folder / INTERPRETER
-
-
-def _is_ready(folder: Path) -> bool:
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return False
-    try:
-        ready = json.loads((folder / MARKER).read_bytes())["requirements"] == list(REQUIREMENTS)
-    except (OSError, ValueError, KeyError, TypeError):
-        ready = False
-    if not ready or not (folder / INTERPRETER).exists():
-        raise DataError(
-            f"--blender-env {folder}: exists and is not an environment for {', '.join(REQUIREMENTS)} made by this "
-            "command. Choose another folder, or remove this one."
+        folder = default_python().parents[1]
+        raise BlenderError(
+            f"--blender-python {python}: no such program. Make an environment with Blender (about 1 GB), once:\n"
+            f"  python{PYTHON} -m venv {folder}\n  {folder}/bin/pip install {' '.join(map(repr, REQUIREMENTS))}"
         )
-    return True
-
-
-def _install(folder: Path, base: Path, run: Runner) -> None:
-    pip = [str(folder / INTERPRETER), "-I", "-m", "pip", "install", "--disable-pip-version-check", *REQUIREMENTS]
-    for command in ([str(base), "-m", "venv", str(folder)], pip):
-        done = run(command, capture_output=True, text=True)
-        if done.returncode != 0:
-            said = "\n".join((done.stderr or done.stdout or "").strip().splitlines()[-TAIL:])
-            raise BlenderError(
-                f"{' '.join(command)}: failed (exit code {done.returncode}):\n{said}\nMend this, or bring a Python "
-                "that has bpy with --blender-python."
-            )
-
-
-def _base_python(run: Runner) -> Path:
-    """An interpreter of the version that bpy is made for."""
-    for candidate in (sys.executable, shutil.which(f"python{PYTHON}")):
-        if candidate:
-            question = [candidate, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
-            done = run(question, capture_output=True, text=True)
-            if done.returncode == 0 and done.stdout.strip() == PYTHON:
-                return Path(candidate)
-    raise ConfigError(
-        f"bpy {BPY} needs Python {PYTHON}, and there is no python{PYTHON} on the path. Install it, or bring a Python "
-        "that has bpy with --blender-python."
-    )
+    return BlenderProcess(python.absolute())

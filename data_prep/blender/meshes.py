@@ -9,14 +9,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyElement
 
 from data_prep.common.spread import farthest
 from gausim.core import DataError
-from gausim.io.ply import list_properties, positions, read_ply
+
+if TYPE_CHECKING:
+    from plyfile import PlyElement
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -104,6 +106,8 @@ def _fan(corners: Sequence[int]) -> list[tuple[int, int, int]]:
 
 
 def _read_ply(path: Path) -> tuple[Array, Indices]:
+    from gausim.io.ply import positions, read_ply
+
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     for element in read_ply(path):
         if element.name == "vertex":
@@ -114,6 +118,8 @@ def _read_ply(path: Path) -> tuple[Array, Indices]:
 
 
 def _faces(path: Path, element: PlyElement) -> Indices:
+    from gausim.io.ply import list_properties
+
     lists = list_properties(element)
     chosen = next((name for name in FACE_FIELDS if name in lists), None)
     if chosen is None:

@@ -29,7 +29,7 @@ from data_prep.blender.plan import (
     still_entries,
     still_job,
 )
-from data_prep.common.photos import write_image
+from data_prep.common.photos import write_picture
 from data_prep.common.progress import Tick
 from data_prep.common.stage import PLAN, files_in, write_npz
 from gausim.core import DataError
@@ -174,6 +174,6 @@ def _write_overview(root: Path, plan: Plan) -> None:
     for number in range(min(plan.sequences, 6)):
         folder, view = sequence_folder(root, number), plan.view_names[number % plan.views]
         pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.pictures.resolution) for frame in frames]
-        shown = [picture[..., 2::-1] * (picture[..., 3:] / 255) for picture in pictures]
+        shown = [picture[..., :3] * (picture[..., 3:] / 255) for picture in pictures]
         rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))
-    write_image(root / "overview.png", np.vstack(rows), 3)
+    write_picture(root / "overview.png", np.vstack(rows), 3)

@@ -1,4 +1,4 @@
-"""Fields of the public sets' files, checked: numbers of a shape, lenses, poses, file names inside a folder."""
+"""Fields of the public sets' files, checked: records, lenses, poses, names of files inside a folder."""
 
 from __future__ import annotations
 
@@ -19,21 +19,18 @@ _ROTATION_TOLERANCE = 1e-3
 _SKEW = 1e-3
 # Steps of time may differ by this fraction of a frame.
 _UNEVEN = 0.01
-_NESTED: dict[int, Any] = {1: list[float], 2: list[list[float]], 3: list[list[list[float]]]}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 REMEDY = "Take the file that the set's authors publish."
 
 
-def read_list(path: Path, what: str) -> list[Any]:
-    """The content of a JSON file that holds a list.
+def read_record(path: Path, kind: Any) -> Any:
+    """The content of a JSON file, converted to a type.
 
     Raises:
-        DataError: it is missing, no JSON, or no list with something in it.
+        DataError: it is missing, no JSON, or a field is missing or of another type.
     """
-    entries = read_any_json(path)
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list of {what}, got {str(entries)[:60]}.")
-    return entries
+    return checked(read_any_json(path), kind, str(path), REMEDY)
 
 
 def rate_of(times: list[float], where: str) -> float:
@@ -48,18 +45,6 @@ def rate_of(times: list[float], where: str) -> float:
     return float(1 / steps.mean())
 
 
-def field(data: Any, key: str, kind: Any, where: str) -> Any:
-    """A field of a JSON object, converted to a type.
-
-    Raises:
-        DataError: the object has no such field, or it is of another type.
-    """
-    if not isinstance(data, dict) or key not in data:
-        found = f"fields {sorted(map(str, data))[:12]}" if isinstance(data, dict) else f"a {type(data).__name__}"
-        raise DataError(f"{where}: field '{key}' is missing, found {found}. {REMEDY}")
-    return checked(data[key], kind, f"{where}: field '{key}'", REMEDY)
-
-
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     """A float64 array of this shape from nested lists or an array; −1 stands for any length but 0.
 
@@ -68,17 +53,15 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     """
     wrong = f"{where}: expected finite numbers of shape ({', '.join('?' if n < 0 else str(n) for n in shape)})"
     try:
-        if isinstance(value, np.ndarray):
-            array = np.array(value, np.float64) if value.dtype.kind in "iuf" else np.empty((0,))
-        else:
-            array = np.array(checked(value, _NESTED[len(shape)], where, REMEDY), np.float64)
+        array = np.asarray(value)
     except ValueError:
         raise DataError(f"{wrong}, got rows of different lengths. {REMEDY}") from None
-    if array.ndim != len(shape) or not all(n == m or n < 0 < m for n, m in zip(shape, array.shape, strict=True)):
-        raise DataError(f"{wrong}, got shape {tuple(array.shape)}. {REMEDY}")
+    fits = array.ndim == len(shape) and all(n == m or n < 0 < m for n, m in zip(shape, array.shape, strict=True))
+    if not fits or array.dtype.kind not in "iuf":
+        raise DataError(f"{wrong}, got {array.dtype} of shape {tuple(array.shape)}. {REMEDY}")
     if not (np.abs(array) <= _LARGEST).all():
         raise DataError(f"{wrong} up to {_LARGEST:g}, found NaN, infinity or more. {REMEDY}")
-    return array
+    return array.astype(np.float64)
 
 
 def lens(value: Any, where: str) -> np.ndarray:
@@ -125,26 +108,25 @@ def viewmat(value: Any, where: str, *, opengl: bool = False, inverse: bool = Fal
     return OPENGL_TO_OPENCV @ matrix if opengl else matrix
 
 
-def inside(folder: Path, name: Any, where: str) -> Path:
+def inside(folder: Path, name: str, where: str) -> Path:
     """The path of a file by its name within a folder.
 
     Raises:
         DataError: the name is none, or leads out of the folder.
     """
-    good = isinstance(name, str) and name.isprintable() and 0 < len(name) <= 1000
-    parts = Path(name).parts if good else ()
+    parts = Path(name).parts if name.isprintable() and 0 < len(name) <= 1000 else ()
     if not parts or Path(name).is_absolute() or ".." in parts or any(len(part.encode()) > 255 for part in parts):
         raise DataError(f"{where}: expected a file name inside {folder}, got {name!r:.80}. {REMEDY}")
     return folder / name
 
 
-def check_name(name: Any, where: str) -> str:
+def check_name(name: str, where: str) -> str:
     """A camera's or a sequence's name, which becomes a folder.
 
     Raises:
         DataError: it is no plain name.
     """
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
+    if not _NAME.fullmatch(name):
         raise DataError(f"{where}: expected a name of letters, digits, '_', '.' and '-', got {name!r:.80}. {REMEDY}")
     return name
 

@@ -1,4 +1,4 @@
-"""What an importer has read of one object, before it is written in our layout."""
+"""What a reader of a public set has found of one object, before it is written in our layout."""
 
 from __future__ import annotations
 
@@ -10,10 +10,27 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.capture.cameras.lenses import Straightened, straighten
+from data_prep.capture.cameras.sources import Posed
+from data_prep.common.command import Options, names, option
+from data_prep.common.photos import read_mask, read_picture
 from gausim.core.errors import ConfigError, DataError
 
 # Standard gravity of the sets whose worlds are in metres [m/s^2]; their simulators and ours use this value.
 GRAVITY = 9.8
+
+
+@dataclass(frozen=True)
+class ImportOptions(Options):
+    """Options of every reader."""
+
+    name: str | None = option(None, "of the object (the folder's)")
+    fps: float | None = option(None, "frames per second (what the set says)", least=1e-3, most=1e4)
+    train_frames: int | None = option(None, "first frames to train on (the set's own split)", least=2, metavar="N")
+    heldout: tuple[str, ...] = option((), "cameras never to train on (none)", type=names, metavar="CAM,CAM")
+    longest: int | None = option(
+        None, "reduce pictures whose longer side is longer (keep them)", least=16, metavar="PIXELS"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +57,7 @@ class Picture:
     """One picture to be read later."""
 
     files: tuple[Path, ...]  # everything that it is made of
-    read: Callable[[], np.ndarray]  # its pixels, (H, W, 4) uint8 RGBA with straight alpha
-
-
-@dataclass(frozen=True, eq=False)
-class Hands:
-    """Points of the hands that hold the object."""
-
-    points: np.ndarray  # (F, C, 3) path of C points [scene units]
-    hand: np.ndarray  # (C,) int64 index of the hand that a point belongs to
+    read: Callable[[], np.ndarray]  # its pixels, (H, W, 4) uint8 RGBA with straight alpha; opaque without a mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +68,7 @@ class Motion:
     source: Path  # the file, or the folder, that lists its frames
     views: tuple[View, ...]  # its cameras
     pictures: Mapping[str, tuple[Picture, ...]]  # by camera, F each
-    hands: Hands | None = None  # what holds the object
+    hands: tuple[np.ndarray, np.ndarray] | None = None  # path (F, C, 3) of points that hold it, (C,) int64 their hands
     tracks: np.ndarray | None = None  # (F, P, 3) true positions of the object's rest points [scene units]
 
     @property
@@ -78,11 +87,12 @@ class PublicObject:
     train_frames: int  # the first frames, to train on
     motions: tuple[Motion, ...]  # its sequences, with the same cameras by name
     heldout: tuple[str, ...] = ()  # cameras that are never trained on
-    world: Mapping[str, Any] = field(default_factory=dict)  # gravity, floor, free, grip, as in dataset.json
+    facts: Mapping[str, Any] = field(default_factory=dict)  # further fields of dataset.json, such as gravity
     stills: tuple[tuple[View, Picture], ...] = ()  # posed stills of the rest state; none: frame 0 of the first sequence
     cloud: tuple[np.ndarray, np.ndarray] | None = None  # points (P, 3) to begin a reconstruction with, colours uint8
+    scene: Callable[[Path], dict[str, int] | None] = lambda work: None  # writes the set's Gaussians, tells their number
     files: Mapping[str, Path] = field(default_factory=dict)  # what was read besides pictures, by name
-    told: Mapping[str, Any] = field(default_factory=dict)  # what is worth telling (plain data)
+    notes: Mapping[str, str] = field(default_factory=dict)  # what is worth telling
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -106,8 +116,8 @@ class PublicObject:
             ConfigError: held-out cameras are no part of the cameras.
         """
         sequences, stills = [motion.name for motion in self.motions], [view.name for view, _ in self.stills]
-        for what, names in (("sequences", sequences), ("stills", stills)):
-            twice = sorted({name for name in names if names.count(name) > 1})
+        for what, found in (("sequences", sequences), ("stills", stills)):
+            twice = sorted({name for name in found if found.count(name) > 1})
             if twice:
                 raise DataError(f"{self.root}: two {what} would get the name '{twice[0]}'. Rename one of their files.")
         for motion in self.motions:
@@ -126,6 +136,31 @@ class PublicObject:
         return self
 
 
-def floor(point: tuple[float, float, float], normal: tuple[float, float, float]) -> dict[str, list[float]]:
-    """A floor as dataset.json has it; friction and restitution are left to training."""
-    return {"point": list(point), "normal": list(normal)}
+def falling(axis: int, sign: int, height: float = 0.0, gravity: float = GRAVITY) -> dict[str, Any]:
+    """Facts of a free body above a floor: up is an axis times a sign; friction and restitution are trained."""
+    up, point = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    up[axis], point[axis] = float(sign), height
+    pull = [0.0, 0.0, 0.0]
+    pull[axis] = -sign * gravity
+    return {"gravity": pull, "floor": {"point": point, "normal": up}, "free": True}
+
+
+def pinhole(name: str, shot: Posed) -> tuple[View, Straightened]:
+    """The pinhole camera of a posed photo whose lens may be distorted, and what removes the distortion."""
+    straight = straighten(shot.camera, shot.photo.path)
+    return View(name, (shot.photo.width, shot.photo.height), straight.intrinsics, shot.viewmat), straight
+
+
+def flattened(
+    path: Path, straight: Straightened, size: tuple[int, int], mask: Path | None,
+    read: Callable[[], np.ndarray] | None = None,
+) -> Picture:  # fmt: skip
+    """A picture without distortion, with a mask as alpha where there is one; ``read`` gives pixels of no file."""
+
+    def pixels() -> np.ndarray:
+        found = read_picture(path) if read is None else read()
+        if mask is not None and found.shape[:2] == (size[1], size[0]):
+            found = np.dstack((found[..., :3], read_mask(mask, size, path.name)))
+        return straight(found) if found.shape[:2] == (size[1], size[0]) else found
+
+    return Picture((path, *((mask,) if mask is not None else ())), pixels)

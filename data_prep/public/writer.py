@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 
 from data_prep.capture.cameras.output import write_cameras
-from data_prep.capture.masks.clips import write_picture
 from data_prep.common.objects import object_facts, refuse_faults
+from data_prep.common.photos import resized, write_picture
 from data_prep.common.progress import Tick
 from data_prep.common.stage import copy_missing, write_npz
-from data_prep.public.pictures import resized
 from data_prep.public.scene import Motion, Picture, PublicObject, View
 from gausim.core.errors import DataError
 from gausim.io.files import write_json
-
-POINTS = "points.npz"
+from gausim.io.pixels import read_header
 
 
 class ObjectWriter:
@@ -27,6 +25,7 @@ class ObjectWriter:
     def __init__(self, work: Path, found: PublicObject, *, longest: int | None, tick: Tick) -> None:
         """Takes the folder to write to, what was read, the longest side of pictures [pixels], and who is told."""
         self._work, self._found, self._longest, self._tick = work, found, longest, tick
+        self._bare: set[str] = set()
 
     def write(self, out: Path) -> dict[str, Any]:
         """Writes everything that is missing and returns what is worth telling; ``out`` is the result's later name.
@@ -41,13 +40,15 @@ class ObjectWriter:
         self._truth()
         if found.cloud is not None:
             points, colors = found.cloud
-            write_npz(self._work / POINTS, points=points.astype(np.float32), colors=colors)
-        facts = object_facts(found.name, found.fps, found.views, found.heldout, found.train_frames) | dict(found.world)
+            write_npz(self._work / "points.npz", points=points.astype(np.float32), colors=colors)
+        scene = found.scene(self._work)
+        facts = object_facts(found.name, found.fps, found.views, found.heldout, found.train_frames) | dict(found.facts)
         write_json(self._work / "dataset.json", facts)
-        refuse_faults(self._work, out)
+        if not self._bare:
+            refuse_faults(self._work, out)
         frames = {motion.name: motion.count for motion in found.motions}
-        told = {"points": found.cloud is not None, **found.told}
-        return {"facts": facts, "stills": stills, "sequences": frames, **told}
+        return {"facts": facts, "stills": stills, "sequences": frames, "points": found.cloud is not None,
+                "scene": scene, "without_alpha": sorted(self._bare), "notes": dict(found.notes)}  # fmt: skip
 
     def _motion(self, motion: Motion) -> None:
         folder = self._work / "sequences" / motion.name
@@ -56,13 +57,13 @@ class ObjectWriter:
             small = view.smaller(self._longest)
             for number, picture in enumerate(motion.pictures[view.name]):
                 name = f"{view.name}/{number:04d}.png"
-                self._picture(folder / name, picture, view, small)
+                self._picture(folder / name, picture, view, small, motion.name)
                 entries.append({"file_path": name, "camera": view.name, "frame": number})
                 posed.append(small)
                 self._tick(motion.name, len(posed), len(motion.views) * motion.count)
-        write_poses(folder / "transforms.json", posed, entries, self._found.fps)
+        _write_poses(folder / "transforms.json", posed, entries, self._found.fps)
         if motion.hands is not None:
-            write_npz(folder / "hands.npz", points=motion.hands.points.astype(np.float32), hand=motion.hands.hand)
+            write_npz(folder / "hands.npz", points=motion.hands[0].astype(np.float32), hand=motion.hands[1])
 
     def _stills(self) -> int:
         """Posed stills, or frame 0 of the first sequence in the cameras that are trained on."""
@@ -75,13 +76,14 @@ class ObjectWriter:
             if picture is None:
                 copy_missing(self._work / "sequences" / first.name / view.name / "0000.png", target)
             else:
-                self._picture(target, picture, view, small)
+                self._picture(target, picture, view, small, "stills")
                 self._tick("stills", number, len(shots))
         entries = [{"file_path": f"images/{view.name}.png"} for view in posed]
-        write_poses(folder / "transforms.json", posed, entries, None)
+        _write_poses(folder / "transforms.json", posed, entries, None)
         return len(posed)
 
-    def _picture(self, target: Path, picture: Picture, view: View, small: View) -> None:
+    def _picture(self, target: Path, picture: Picture, view: View, small: View, what: str) -> None:
+        """Writes a picture unless it is there, without alpha where it is opaque, and remembers that."""
         if not target.is_file():
             pixels = picture.read()
             if pixels.shape[:2] != (view.size[1], view.size[0]):
@@ -89,7 +91,11 @@ class ObjectWriter:
                     f"{picture.files[0]}: is {pixels.shape[1]}x{pixels.shape[0]}, its camera '{view.name}' is for "
                     f"{view.size[0]}x{view.size[1]}. Use the pictures that belong to the cameras."
                 )
-            write_picture(target, resized(pixels, small.size))
+            opaque = pixels[..., 3].min() == 255
+            write_picture(target, resized(pixels[..., :3] if opaque else pixels, small.size))
+        header = read_header(target)
+        if header is None or header.mode != "RGBA":
+            self._bare.add(what)
 
     def _truth(self) -> None:
         """True motion, where all sequences have it: rest points as in frame 0 of the first sequence."""
@@ -103,12 +109,7 @@ class ObjectWriter:
             write_npz(path, displacement=(positions - rest).astype(np.float32))
 
 
-def write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]], fps: float | None) -> None:
-    """Writes a ``transforms.json``, all of it or nothing.
-
-    Raises:
-        DataError: the cameras differ in size.
-    """
+def _write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]], fps: float | None) -> None:
     for view in posed:
         if view.size != posed[0].size:
             raise DataError(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_prep.common.photos import natural
 from gausim.core.errors import DataError
+from gausim.io.files import natural
 from gausim.io.pixels import read_header
 from gausim.io.plain_json import read_json
 from gausim.io.transforms import PosedImages, read_transforms

@@ -8,19 +8,17 @@ import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import av
 import numpy as np
 import pytest
 import torch
-import yaml
 from helpers import toy_object
 from helpers.plain import edit_json
 
+from data_prep import ingest, pack, poses, segment, select
 from data_prep.assemble import AssembleOptions, assemble, main
-from data_prep.dataset import main as prepare_main
 from gausim.core import Cameras, ConfigError, DataError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import read_rgba, write_rgba
@@ -229,46 +227,29 @@ class Capture:
                     film.mux(video.encode())
 
 
-SELECT = {"scene": "{reconstruct}/scene.ply", "pinned": "below z=0.1", "size": 64}
-CHROMA = {"backend": "chroma", "key": "00b140", "no_grabcut": True, "components": 0}
-
-
-@pytest.fixture
-def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
-    """With a stand-in for the slow stage: it writes the true kernels, unmarked, and looks at what it is given."""
-    found = Capture(tmp_path / "capture")
-
-    def reconstruct(argv: list[str]) -> int:
-        root, out = Path(argv[0]), Path(argv[argv.index("--out") + 1])
-        assert any((root / name).is_file() for name in ("transforms.json", "static/transforms.json"))
-        bare = replace(found.toy.scene, pinned=torch.zeros(found.toy.scene.count, dtype=torch.bool))
-        save_scene(bare, out / "scene.ply")
-        return 0
-
-    monkeypatch.setitem(sys.modules, "data_prep.reconstruct", SimpleNamespace(main=reconstruct))
-    return found
-
-
-def _config(folder: Path, stages: dict[str, Any]) -> str:
-    path = folder / "object.yaml"
-    path.write_text(yaml.safe_dump({"work": "work", "stages": stages}, sort_keys=False))
-    return str(path)
-
-
-def test_one_command_from_films_to_a_data_set(capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_films_to_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All stages but the slow one, which the true kernels stand for."""
+    capture = Capture(tmp_path / "capture")
     capture.write_films()
-    config = _config(capture.folder, {
-        "ingest": {"films": "takes", "sync": "offsets", "offsets": "cam_0=0,cam_1=2f,cam_2=0"},
-        "poses": {"transforms": "photos/calibration.json", "sequences": "{ingest}"},
-        "segment": {"pictures": "{poses}", **CHROMA},
-        "reconstruct": {"root": "{segment}"},
-        "select": SELECT,
-        "assemble": {"pictures": "{segment}", "scene": "{select}", "name": "toy", "train_frames": 6},
-        "pack": {"root": "{assemble}"},
-    })  # fmt: skip
-    assert prepare_main([config]) == 0, capsys.readouterr().err
-    work = capture.folder / "work"
-    for root in (work / "assemble", work / "pack"):
+    bare = replace(capture.toy.scene, pinned=torch.zeros(capture.toy.scene.count, dtype=torch.bool))
+    save_scene(bare, tmp_path / "rest" / "scene.ply")
+    jobs: dict[Any, list] = {
+        ingest: [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
+        poses: ["--transforms", capture.folder / "photos/calibration.json", "--sequences", tmp_path / "ingest"],
+        segment: [tmp_path / "poses", *"--backend chroma --key 00b140 --no-grabcut --components 0".split()],
+        select: [tmp_path / "rest" / "scene.ply", "--pinned", "below z=0.1", "--size", "64"],
+        sys.modules["data_prep.assemble"]: [
+            tmp_path / "segment",
+            "--scene",
+            tmp_path / "select",
+            *"--name toy --train-frames 6".split(),
+        ],
+        pack: [tmp_path / "assemble"],
+    }
+    for stage, argv in jobs.items():
+        out = tmp_path / stage.__name__.rpartition(".")[2]
+        assert stage.main([*map(str, argv), "--out", str(out)]) == 0, capsys.readouterr().err
+    for root in (tmp_path / "assemble", tmp_path / "pack"):
         assert verify(root) == []
         data = ObjectData(root)
         assert data.name == "toy" and len(data.stills().images) == 3 and data.sequences[0].count == 10
@@ -283,9 +264,6 @@ def test_one_command_from_films_to_a_data_set(capture: Capture, capsys: pytest.C
             assert (found[..., :3].int() - truth[..., :3].int()).abs()[both].float().mean() < 12
             same = record.cameras_of(("cam_0", "cam_1", "cam_2"))
             assert torch.allclose(same.viewmats, capture.toy.views.viewmats, atol=1e-4)
-    module = ReadyDataModule(root=str(work / "pack"), plan=TrainingPlan(t_start=1, t_max=5, batch_size=1))
+    module = ReadyDataModule(root=str(tmp_path / "pack"), plan=TrainingPlan(t_start=1, t_max=5, batch_size=1))
     module.setup("fit")
-    sample = next(iter(module.train_dataloader()))
-    assert sample is not None
-    capsys.readouterr()
-    assert prepare_main([config]) == 0 and capsys.readouterr().out.count("there already") == 6
+    assert next(iter(module.train_dataloader())) is not None

@@ -23,11 +23,11 @@ from helpers.plain import contents
 
 from data_prep.blender import environment as blender_env
 from data_prep.blender import plan as planning
-from data_prep.blender.environment import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
+from data_prep.blender.environment import BlenderError, BlenderProcess, find_blender
 from data_prep.blender.meshes import Surface, make_surface, read_mesh
 from data_prep.blender.plan import Pictures, Plan, Soft, action, cage, camera
 from data_prep.blender_bunny import main, make_set
-from gausim.core import ConfigError, DataError
+from gausim.core import ConfigError
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
 
@@ -188,54 +188,6 @@ def test_cage_encloses_the_object_with_even_cells(surface: Surface) -> None:
 # -------------------------------------------------------------------------------------------------------- environment
 
 
-class FakeRunner:
-    """Stands in for subprocess.run: makes an interpreter when asked for an environment; may fail at pip."""
-
-    def __init__(self, *, pip: int = 0, version: str = "3.11") -> None:
-        self.pip, self.version = pip, version
-        self.commands: list[list[str]] = []
-
-    def __call__(self, command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        self.commands.append(command)
-        if "venv" in command:
-            (Path(command[-1]) / "bin").mkdir(parents=True)
-            (Path(command[-1]) / "bin" / "python").write_text("")
-        if "pip" in command:
-            return subprocess.CompletedProcess(command, self.pip, "", "no matching distribution" if self.pip else "")
-        return subprocess.CompletedProcess(command, 0, self.version + "\n", "")
-
-
-def test_environment_is_created_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runner = FakeRunner()
-    python = create_environment(tmp_path / "cache" / "blender", run=runner)
-    assert python == tmp_path / "cache" / "blender" / "bin" / "python" and python.exists()
-    assert runner.commands[-1][-2:] == list(REQUIREMENTS) and "venv" in runner.commands[-2]
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "bpy==" in said and str(tmp_path / "cache" / "blender") in said
-    again = FakeRunner()
-    assert find_blender(None, tmp_path / "cache" / "blender", run=again).python == python
-    assert again.commands == [] and capsys.readouterr().err == ""
-
-
-def test_failed_installation_says_why_and_leaves_nothing(tmp_path: Path) -> None:
-    (tmp_path / ".blender.making" / "bin").mkdir(parents=True)  # of an installation that was killed
-    with pytest.raises(ConfigError, match=r"needs Python 3\.11(.|\n)*--blender-python"):
-        create_environment(tmp_path / "blender", run=FakeRunner(version="3.12"))
-    with pytest.raises(BlenderError, match="no matching distribution(.|\n)*--blender-python"):
-        create_environment(tmp_path / "blender", run=FakeRunner(pip=1))
-    assert [p.name for p in tmp_path.iterdir()] == [".blender.lock"]
-    create_environment(tmp_path / "blender", run=FakeRunner())
-    assert sorted(p.name for p in (tmp_path / "blender").iterdir()) == ["bin", blender_env.MARKER]
-
-
-def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
-    for content in ("{", '{"requirements": ["bpy==3.0"]}', "[]"):
-        (tmp_path / blender_env.MARKER).write_text(content)
-        with pytest.raises(DataError, match="--blender-env"):
-            create_environment(tmp_path, run=FakeRunner())
-        assert (tmp_path / blender_env.MARKER).read_text() == content
-
-
 # ---------------------------------------------------------------------------------------------------------- processes
 
 
@@ -266,7 +218,7 @@ def test_a_failed_process_says_why(tmp_path: Path) -> None:
     with pytest.raises(BlenderError, match="cannot be started"):
         BlenderProcess(tmp_path / "absent").run({}, lambda _: None, threading.Event())
     with pytest.raises(BlenderError, match="--blender-python"):
-        find_blender(tmp_path / "absent", tmp_path)
+        find_blender(tmp_path / "absent")
     with pytest.raises(BlenderError, match="did not tell its versions"):
         BlenderProcess(program(tmp_path / "silent", "sys.stdin.read()")).versions()
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,14 +12,12 @@ import av
 import cv2
 import numpy as np
 import pytest
-from helpers.timecodes import label_of_frame
 
 from data_prep.capture.films.film import probe
 from data_prep.capture.films.sync import measure
 from data_prep.capture.films.takes import find_takes, offset_seconds
 from data_prep.ingest import IngestOptions, ingest, main
 from gausim.core import DataError
-from gausim.io.files import natural
 
 Refused = Callable[..., str]
 NTSC = Fraction(30000, 1001)
@@ -52,7 +48,6 @@ class Camera:
     start: float
     rate: Fraction
     frames: int
-    timecode: str | None = None
     audio: str | None = "aac"
     loud: float = 1.0
     lamp: bool = True
@@ -81,8 +76,6 @@ class Camera:
             video.options = {"crf": self.crf, "preset": "veryfast"}
             if self.turned:
                 video.set_display_rotation(self.turned)
-            if self.timecode:
-                film.metadata["timecode"] = video.metadata["timecode"] = self.timecode
             track = film.add_stream(self.audio, rate=RATE, layout="mono") if self.audio else None
             for k in range(self.frames):
                 frame = av.VideoFrame.from_ndarray(self.picture(k), format="rgb24")
@@ -110,24 +103,13 @@ class Camera:
         film.mux(track.encode())
 
 
-def label(rate: Fraction, frame: int, *, drop: bool) -> str:
-    return label_of_frame(frame, base=round(rate), drop=drop)
-
-
 def three_cameras(rate: Fraction, late: float = 7.3) -> dict[str, Camera]:
     """The second camera begins ``late`` frames after the first, the third three frames before the first."""
-    drop = rate.denominator != 1
-    # Just before a minute, so that drop-frame labels are left out between the cameras' starts.
-    first = 1796 if drop else round(rate) * 60 - 4
-    frame = 1 / float(rate)
-    count = int(1.6 * rate)
-
-    def camera(i: int, start: float, audio: str) -> Camera:
-        return Camera(
-            0.2 + start * frame, rate, count, label(rate, first + int(np.floor(start)), drop=drop), audio, seed=i
-        )
-
-    return {"cam_0": camera(0, 0, "aac"), "cam_1": camera(1, late, "pcm_s16le"), "cam_2": camera(2, -3, "aac")}
+    frame, count = 1 / float(rate), int(1.6 * rate)
+    audio = ("aac", "pcm_s16le", "aac")
+    return {
+        f"cam_{i}": Camera(0.2 + start * frame, rate, count, audio[i], seed=i) for i, start in enumerate((0, late, -3))
+    }
 
 
 @pytest.fixture(scope="module", params=[Fraction(50), NTSC], ids=["50", "29.97"])
@@ -139,18 +121,15 @@ def filmed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return request.param, folder
 
 
-@pytest.mark.parametrize(("method", "expected"), [("audio", 7.3), ("flash", 7.3), ("timecode", 7.0)])
-def test_offsets_are_found_to_a_quarter_frame(filmed: tuple[Fraction, Path], method: str, expected: float) -> None:
-    """Sound and flash see the three tenths of a frame; time code has whole frames, and says so."""
+@pytest.mark.parametrize("method", ["audio", "flash"])
+def test_offsets_are_found_to_a_quarter_frame(filmed: tuple[Fraction, Path], method: str) -> None:
     rate, folder = filmed
     take = find_takes(folder)[0]
     films = {name: probe(path) for name, path in take.films.items()}
     assert all(film.rate == rate and not film.variable for film in films.values())
     offsets = measure(films, method, given={})
     later = {name: (offsets.seconds[name] - offsets.seconds["cam_0"]) * float(rate) for name in films}
-    assert later["cam_1"] == pytest.approx(expected, abs=0.25 if method != "timecode" else 1e-9)
-    assert later["cam_2"] == pytest.approx(-3, abs=0.25 if method != "timecode" else 1e-9)
-    assert (method == "timecode") == any("whole frames" in note for note in offsets.notes)
+    assert later["cam_1"] == pytest.approx(7.3, abs=0.25) and later["cam_2"] == pytest.approx(-3, abs=0.25)
     assert offsets.resolution["cam_1"] * float(rate) <= 0.5
 
 
@@ -159,7 +138,7 @@ def test_frames_come_out_synchronised(filmed: tuple[Fraction, Path], tmp_path: P
     """Each output frame shows the disc where it was, within the residual that is reported, as the decoder gave it."""
     rate, folder = filmed
     found = ingested(folder, tmp_path / "out", sync=method)
-    assert found["method"] == ("timecode" if method == "auto" else method)
+    assert found["method"] == ("audio" if method == "auto" else method)
     cameras, truth = found["cameras"], three_cameras(rate)
     reference = truth[found["reference"]]
     first = {name: facts["kept"][0] for name, facts in cameras.items()}
@@ -188,7 +167,7 @@ def test_frames_come_out_synchronised(filmed: tuple[Fraction, Path], tmp_path: P
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short films of 25 frames per second without sound, lamp or time code; the second begins 2.5 frames later."""
+    """Two short films of 25 frames per second without sound or lamp; the second begins 2.5 frames later."""
     folder = tmp_path_factory.mktemp("pair")
     for i in range(2):
         Camera(0.1 * i, Fraction(25), 20, audio=None, lamp=False, seed=i).write(folder / f"side_{i}.mp4")
@@ -216,7 +195,7 @@ def ingested(folder: Path, out: Path, **options: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("options", "messages"),
     [
-        ("", ("timecode: cam_0 (side_0.mp4): has no time code", "audio: cam_0 (side_0.mp4): has no sound",
+        ("", ("audio: cam_0 (side_0.mp4): has no sound",
               "flash: cam_0 (side_0.mp4): no flash", "--offsets")),
         ("--sync offsets --offsets cam_1=5s", ("cam_1 (side_1.mp4) begins", "no time in common")),
         ("--sync offsets --offsets cam_1=0 --start 5", ("after leaving out 5 s",)),
@@ -243,19 +222,6 @@ def test_silence_and_strangers_sounds_are_refused(tmp_path: Path) -> None:
     films["cam_1"] = probe(tmp_path / "c.mp4")
     with pytest.raises(DataError, match=r"cam_1 \(c.mp4\) against cam_0.*does not tell where it belongs"):
         measure(films, "audio", given={})
-
-
-def test_time_code_that_the_sound_contradicts_is_refused(
-    filmed: tuple[Fraction, Path], tmp_path: Path, refused: Refused
-) -> None:
-    """auto does not believe a camera whose time code was never set."""
-    rate, folder = filmed
-    (tmp_path / "in").mkdir()
-    os.link(folder / "cam_0.mp4", tmp_path / "in" / "cam_0.mp4")
-    unset = label(rate, 1810, drop=rate.denominator != 1)
-    replace(three_cameras(rate)["cam_1"], timecode=unset, audio="aac").write(tmp_path / "in" / "cam_1.mp4")
-    message = refused(tmp_path / "in")
-    assert "cam_1 (cam_1.mp4): its time code and its sound disagree" in message and "--sync audio" in message
 
 
 @pytest.mark.parametrize("offset", ["2.5f", "0.1"])
@@ -334,7 +300,7 @@ def test_broken_films_are_named(tmp_path: Path, refused: Refused, suffix: str, f
 # ---- which films, and starting again
 
 
-def test_folders_and_lists_name_the_same_sequences(tmp_path: Path) -> None:
+def test_folders_are_sequences_in_natural_order(tmp_path: Path) -> None:
     for take in ("take_10", "take_2"):
         for camera in ("left", "right"):
             (tmp_path / take).mkdir(exist_ok=True)
@@ -342,56 +308,27 @@ def test_folders_and_lists_name_the_same_sequences(tmp_path: Path) -> None:
     takes = find_takes(tmp_path)
     assert [(t.name, t.source) for t in takes] == [("seq_000", "take_2"), ("seq_001", "take_10")]
     assert takes[0].labels == {"cam_0": "left", "cam_1": "right"}
-    entries = [{"name": t.source, "cameras": {k: f"{t.source}/{k}.mp4" for k in ("left", "right")}} for t in takes]
-    entries[1].update(offsets={"right": 0.5}, start=1)
-    (tmp_path / "list.json").write_text(json.dumps({"sequences": entries}))
-    listed = find_takes(tmp_path / "list.json")
-    assert [t.films for t in listed] == [t.films for t in takes]
-    assert listed[1].offsets == {"right": "0.5"} and listed[1].start == 1 and listed[0].start is None
-
-
-def _touch(*names: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        for name in names:
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).touch()
-        return folder
-
-    return make
-
-
-def _list(text: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        (folder / "list.json").write_text(text)
-        return folder / "list.json"
-
-    return make
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("names", "message"),
     [
-        (_touch(), "no films in it"),
-        (_touch("a.mp4", "b/c.mp4"), "both in it and in b"),
-        (_touch("a.mp4", "a.mov"), "name one camera"),
-        (_touch("x/a.mp4", "x/b.mp4", "y/a.mp4"), "sequence 'y' has the cameras"),
-        (_list("{"), "cannot be read as JSON"),
-        (_list('{"sequences": []}'), "'sequences': .*length >= 1"),
-        (_list('{"sequences": [3]}'), r"'sequences\[0\]': expected 'object', got 'int'"),
-        (_list('{"sequences": [{"cameras": {"a": 1}}]}'), r"'sequences\[0\]\.cameras\[...\]': expected 'str'"),
-        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "start": NaN}]}'), r"list\.json: .* as JSON.*byte 52"),
-        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offset": {}}]}'), "unknown field 'offset'"),
-        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offsets": {"a": true}}]}'), r"\.offsets\[...\]': expected"),
+        ((), "no films in it"),
+        (("a.mp4", "b/c.mp4"), "both in it and in b"),
+        (("a.mp4", "a.mov"), "name one camera"),
+        (("x/a.mp4", "x/b.mp4", "y/a.mp4"), "sequence 'y' has the cameras"),
     ],
 )
-def test_unclear_inputs_are_refused(tmp_path: Path, make: Callable[[Path], Path], message: str) -> None:
+def test_unclear_folders_are_refused(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
     with pytest.raises(DataError, match=message):
-        find_takes(make(tmp_path))
+        find_takes(tmp_path)
 
 
-def test_offsets_and_natural_order() -> None:
+def test_offsets_are_seconds_or_frames() -> None:
     assert offset_seconds("7.3f", 50) == pytest.approx(0.146) and offset_seconds("-0.5s", 50) == -0.5
     for text in ("", "abc", "1e999", "nan", "7 frames"):
         with pytest.raises(DataError, match="offset"):
             offset_seconds(text, 25)
-    assert sorted(["cam_10", "cam_2", "b", "3"], key=natural) == ["3", "b", "cam_2", "cam_10"]

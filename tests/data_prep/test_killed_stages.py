@@ -18,11 +18,9 @@ from gausim.data.verify import verify
 ROOT = Path(__file__).parents[2]
 CAPTURE = runpy.run_path(str(Path(__file__).with_name("test_assemble.py")))["Capture"]
 ROOM = runpy.run_path(str(Path(__file__).with_name("test_poses.py")))
-READY = runpy.run_path(str(ROOT / "tests" / "fuzz" / "corpus.py"))["_ready"]
 Run = Callable[..., dict[str, Any]]
-STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready",
-          "import_springgaus", "import_springgaus-real", "import_pacnerf", "import_phystwin", "import_3dgsim",
-          "import_physdreamer", "poses-mapping", "synthesize", "corpus")  # fmt: skip
+STAGES = ("ingest", "poses", "segment", "select", "assemble", "pack", "public", "poses-mapping",
+          "synthesize", "corpus")  # fmt: skip
 SHARES = (0.0, 0.5, 1.0)
 
 
@@ -42,32 +40,17 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
     from gausim.io.ply import save_scene
 
     save_scene(capture.toy.scene, folder / "rest" / "scene.ply")
-    list(READY(folder))
     ROOM["write_photos"](folder / "room")
-    public = {
-        "import_springgaus": lambda: public_sets.write_springgaus(folder / "torus"),
-        "import_springgaus-real": lambda: public_sets.write_springgaus_real(folder / "real"),
-        "import_pacnerf": lambda: public_sets.write_pacnerf(folder / "bird", kind="plate"),
-        "import_phystwin": lambda: public_sets.write_phystwin(folder / "different_types" / "sloth"),
-        "import_3dgsim": lambda: public_sets.write_3dgsim(folder / "genesis", moved="0002"),
-        "import_physdreamer": lambda: public_sets.write_physdreamer(folder / "hat"),
-    }
+    public_sets.write_physdreamer(folder / "hat")
     whole = {stage: folder / "whole" / stage for stage in STAGES}
     arguments = {
         "ingest": [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
         "poses": ["--transforms", capture.folder / "photos/calibration.json", "--sequences", whole["ingest"]],
         "segment": [whole["poses"], *"--backend chroma --key 00b140 --no-grabcut --components 0".split()],
-        "reconstruct": [whole["segment"], *"--iterations 10 --kernels 40 --coarse 0 --leave-out 2".split()],
         "select": [folder / "rest" / "scene.ply", "--pinned", "below z=0.1", "--size", "64"],
         "assemble": [whole["segment"], "--scene", whole["select"], "--name", "toy"],
         "pack": [whole["assemble"]],
-        "import_ready": [folder / "ready", "--train-frames", "2"],
-        "import_springgaus": [folder / "torus"],
-        "import_springgaus-real": [folder / "real", "--object", "bun", "--turns", "20", "--least-overlap", "0"],
-        "import_pacnerf": [folder / "bird"],
-        "import_phystwin": [folder / "different_types" / "sloth"],
-        "import_3dgsim": [folder / "genesis", "--fps", "25"],
-        "import_physdreamer": [folder / "hat", "--anchor", "0.4", "--video-masks", folder / "video_masks"],
+        "public": ["physdreamer", folder / "hat", "--anchor", "0.4", "--video-masks", folder / "video_masks"],
         "poses-mapping": [
             "--images", folder / "room", *"--camera-model SIMPLE_PINHOLE --features 1500 --feature-size 320".split(),
         ],
@@ -83,8 +66,6 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
             for other, result in whole.items():
                 if other != stage and other not in self and result in arguments[stage]:
                     self[other]
-            if stage in public:
-                public[stage]()
             argv = [str(value) for value in arguments[stage]]
             done = run(stage=stage, argv=[*argv, "--out", str(whole[stage])])
             assert done["status"] == 0, done["output"]
@@ -108,7 +89,7 @@ def check(run: Run, stage: str, argv: list[str], whole: Path, places: int, share
 
 
 def test_a_stage_killed_in_its_middle_goes_on(run: Run, jobs: dict, tmp_path: Path) -> None:
-    check(run, "import_ready", *jobs["import_ready"], 0.5, tmp_path)
+    check(run, "public", *jobs["public"], 0.5, tmp_path)
 
 
 @pytest.mark.slow

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from data_prep.capture.masks.cleanup import Cleanup, overlap
-from data_prep.capture.masks.clips import find_clips, read_picture
-from data_prep.capture.masks.onnx_segmenter import NetworkOptions, OnnxSegmenter
-from data_prep.capture.masks.sam2_segmenter import Prompt, Sam2Segmenter, load_predictor, make_prompt
+from data_prep.capture.masks.clips import find_clips
+from data_prep.capture.masks.network import NetworkOptions, OnnxSegmenter
 from data_prep.capture.masks.segmenters import Backend
+from data_prep.common.photos import read_picture
 from data_prep.common.stage import read_manifest
 from data_prep.segment import main, segment
 from gausim.core import ConfigError, DataError
@@ -193,12 +190,12 @@ def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
     ("made", "options", "what"),
     [
         ({}, {"mean": (0.0,), "scale": (1.0,)}, "values of .* expected 0 to 1. Try --onnx-activation"),
-        ({}, {"size": 64}, "--onnx-size says 64"),
+        ({}, {"size": 64}, "--onnx-size is 64"),
         ({}, {"output": 2}, "has outputs 0 to 0, asked for 2"),
-        ({"side": "n"}, {}, "leaves the size of its input open"),
+        ({"side": "n"}, {}, "--onnx-size is None"),
         ({"channels": 1}, {}, "expected one input of float32"),
-        ({"operation": "Identity"}, {}, "expected one map"),
-        ({"operation": "Log"}, {"mean": (255.0,)}, "values that are no numbers"),
+        ({"operation": "Identity"}, {}, "no map of finite"),
+        ({"operation": "Log"}, {"mean": (255.0,)}, "no map of finite"),
     ],
 )
 def test_networks_that_do_not_fit_are_named(tmp_path: Path, made: dict, options: dict, what: str) -> None:
@@ -216,92 +213,17 @@ def test_files_that_are_no_networks_are_named(tmp_path: Path) -> None:
         network_of(tmp_path / "none.onnx")
 
 
-# ---- SAM 2
-
-
-class FakePredictor:
-    """Stands for SAM 2: its object is whatever has the colour under the prompt, logits ±10."""
-
-    def __init__(self, upset: bool = False) -> None:
-        self.prompts: list[dict[str, Any]] = []
-        self.upset = upset
-
-    def init_state(self, video_path: str, offload_video_to_cpu: bool = False) -> Any:
-        files = sorted(Path(video_path).glob("*.jpg"))
-        assert [p.stem for p in files] == [f"{i:05d}" for i in range(len(files))]
-        return SimpleNamespace(frames=[cv2.imread(str(p)).astype(np.float32) for p in files], colour=None)
-
-    def add_new_points_or_box(self, inference_state: Any, frame_idx: int, obj_id: int, **prompt: Any) -> Any:
-        assert (frame_idx, obj_id) == (0, 1)
-        self.prompts.append(prompt)
-        place = prompt["points"][0] if "points" in prompt else (prompt["box"][:2] + prompt["box"][2:]) / 2
-        inference_state.colour = inference_state.frames[0][round(float(place[1])), round(float(place[0]))]
-
-    def propagate_in_video(self, inference_state: Any) -> Iterator[tuple[int, list[int], Any]]:
-        for k, frame in enumerate(inference_state.frames):
-            near = np.abs(frame - inference_state.colour).max(-1) < 40
-            yield k + self.upset, [1], torch.from_numpy(np.where(near, 10.0, -10.0))[None, None]
-
-
-def sam2(predictor: FakePredictor, prompts: dict[str, Prompt]) -> Backend:
-    return Backend("sam2", Sam2Segmenter(predictor, prompts).open, soft=True, settings={"prompts": sorted(prompts)})
-
-
-@pytest.mark.parametrize("prompt", [Prompt(box=(4, 24, 28, 48)), Prompt(points=((16, 36, 1), (90, 5, 0)))])
-def test_sam2_follows_a_prompt(film: Path, tmp_path: Path, prompt: Prompt) -> None:
-    predictor = FakePredictor()
-    # The disc moves by a twelfth of the picture per frame, which the tolerance has to know.
-    segment(film, tmp_path / "out", sam2(predictor, {"": prompt}), Cleanup(motion=0.09))
-    assert agreement(found_masks(tmp_path / "out")) > 0.9
-    assert len(predictor.prompts) == 1 and set(predictor.prompts[0]) == (
-        {"box"} if prompt.box else {"points", "labels"}
-    )
-
-
-def test_sam2_says_what_is_missing(film: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "sam2", None)
-    with pytest.raises(ConfigError, match="package sam2"):
-        load_predictor(tmp_path / "w.pt", "c.yaml", device="cpu")
-    command = [str(film), "--out", str(tmp_path / "out"), "--backend", "sam2"]
-    assert main(command) == 2 and "--sam2-checkpoint" in capsys.readouterr().err
-    assert main([*command, "--sam2-checkpoint", "w.pt"]) == 2 and "--box, --point" in capsys.readouterr().err
-    assert main([*command, "--sam2-checkpoint", "w.pt", "--box", "9,9,2,2"]) == 2
-    assert "x0 < x1" in capsys.readouterr().err
-    assert main([*command, "--sam2-checkpoint", "w.pt", "--point", "9,9,1"]) == 2
-    assert "package sam2" in capsys.readouterr().err
-    with pytest.raises(DataError, match="prompts: none for 'sequences/seq_000/cam_0'"):
-        segment(film, tmp_path / "out", sam2(FakePredictor(), {"cam_7": Prompt((0, 0, 9, 9))}), Cleanup())
-    with pytest.raises(DataError, match="lie outside"):
-        segment(film, tmp_path / "out", sam2(FakePredictor(), {"": Prompt((0, 0, 900, 9))}), Cleanup())
-    with pytest.raises(DataError, match="gave no mask of this picture"):
-        segment(film, tmp_path / "out", sam2(FakePredictor(upset=True), {"": Prompt((4, 24, 28, 48))}), Cleanup())
-    for box, points in ((None, []), (None, [(1, 2, 0)]), ([1, 2, np.nan, 4], []), ([1, 2], []), (None, [(1, 2, 7)])):
-        with pytest.raises(DataError, match="box"):
-            make_prompt({"box": box, "points": points}, "here")
-
-
-def test_sam2_reads_checkpoints_without_running_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights go into the predictor that the package builds; a pickle of code is refused."""
-    built: dict[str, Any] = {}
-
-    def build(config: str, ckpt_path: Any, device: str) -> torch.nn.Module:
-        assert ckpt_path is None
-        built.update(config=config, device=device, model=torch.nn.Linear(2, 1))
-        return built["model"]
-
-    module = SimpleNamespace(build_sam2_video_predictor=build)
-    monkeypatch.setitem(__import__("sys").modules, "sam2", SimpleNamespace(build_sam=module))
-    monkeypatch.setitem(__import__("sys").modules, "sam2.build_sam", module)
-    weights = {"weight": torch.tensor([[3.0, 4.0]]), "bias": torch.tensor([5.0])}
-    torch.save({"model": weights}, tmp_path / "good.pt")
-    assert load_predictor(tmp_path / "good.pt", "c.yaml", device="cpu") is built["model"]
-    assert torch.equal(built["model"].weight, weights["weight"]) and built["config"] == "c.yaml"
-    torch.save({"model": {"weight": weights["weight"]}}, tmp_path / "other.pt")
-    with pytest.raises(DataError, match="does not fit"):
-        load_predictor(tmp_path / "other.pt", "c.yaml", device="cpu")
-    torch.save({"model": SimpleNamespace()}, tmp_path / "code.pt")
-    with pytest.raises(DataError, match="no checkpoint of SAM 2"):
-        load_predictor(tmp_path / "code.pt", "c.yaml", device="cpu")
+def test_masks_of_another_program_are_taken(film: Path, tmp_path: Path, capsys: Any) -> None:
+    """Labels 0 and 1 under the pictures' names; a mask that is missing is named."""
+    for k in range(FRAMES):
+        path = tmp_path / "masks" / "sequences" / "seq_000" / "cam_0" / f"{k:04d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), disc(k).astype(np.uint8))
+    command = [str(film), "--backend", "masks", "--masks", str(tmp_path / "masks")]
+    assert main([*command, "--out", str(tmp_path / "out"), "--motion", "0.09"]) == 0
+    assert agreement(found_masks(tmp_path / "out")) > 0.95
+    path.unlink()
+    assert main([*command, "--out", str(tmp_path / "o")]) == 2 and "0008.png: no mask of" in capsys.readouterr().err
 
 
 def test_masks_that_are_no_masks_are_refused(film: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from data_prep.common.command import Options, option
-from data_prep.common.photos import Photo, read_photo, reduced
+from data_prep.common.photos import Photo, reduced
 from data_prep.common.progress import Tick
 from data_prep.common.stage import write_npz
 from gausim.core.errors import ConfigError, DataError
@@ -103,7 +103,7 @@ def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, numb
     """Writes the features of one photo and returns their number."""
     path = _features_file(work, number)
     if not path.is_file():
-        gray = reduced(cv2.cvtColor(read_photo(photo)[..., :3], cv2.COLOR_BGR2GRAY), options.feature_size)
+        gray = reduced(cv2.cvtColor(photo.read(), cv2.COLOR_RGBA2GRAY), options.feature_size)
         settings = pycolmap.FeatureExtractionOptions()
         settings.num_threads, settings.use_gpu, settings.max_image_size = options.threads, False, max(gray.shape)
         settings.sift.max_num_features = options.features

@@ -11,7 +11,7 @@ import numpy as np
 from data_prep.capture.cameras.lenses import project
 from data_prep.capture.cameras.sources import Posed
 from data_prep.capture.cameras.world import centers
-from data_prep.common.photos import Photo, read_photo
+from data_prep.common.photos import Photo
 from gausim.io.colmap import PointTable
 
 # Fewer features than this are a photo without texture, fewer inliers one that no other photo shares a view with.
@@ -75,10 +75,10 @@ def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:
         known, rows = _observations(shot, points)
         if not known.any():
             continue
-        pixels = read_photo(shot.photo)
+        pixels = shot.photo.read()
         x = shot.xy[known, 0].astype(int).clip(0, shot.photo.width - 1)
         y = shot.xy[known, 1].astype(int).clip(0, shot.photo.height - 1)
-        np.add.at(total, rows, pixels[y, x, 2::-1])
+        np.add.at(total, rows, pixels[y, x, :3])
         np.add.at(count, rows, 1)
     return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
 

@@ -15,8 +15,10 @@ import numpy as np
 from av.error import FFmpegError
 from av.sidedata.sidedata import Type as SideData
 
-from data_prep.capture.films.timecode import Timecode, parse_timecode
+from data_prep.common.photos import resized
 from gausim.core import DataError
+
+FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".mxf")
 
 # Rates that cameras have; a measured rate that fits one of them is that one.
 STANDARD_RATES = (
@@ -25,8 +27,8 @@ STANDARD_RATES = (
 )
 # Clocks of cameras agree to some 1e-5; a container may count in whole milliseconds on top.
 RATE_TOLERANCE = 5e-5
-# Frame intervals further than this from the mean are no rounding: the rate varies.
-JITTER = 0.1
+# Time stamps of phones jitter; up to this part of an interval that is no other rate.
+MOST_JITTER = 0.3
 # Mean and usual gap between frames differ by more than this where frames are missing.
 MISSING = 0.005
 # Transfer functions of high dynamic range (ITU-T H.273): PQ and HLG. Eight bits of them look flat and grey.
@@ -44,10 +46,9 @@ class Film:
     pts: np.ndarray  # time stamps of its N frames in presentation order, in units of ``time_base``
     time_base: Fraction  # of the stamps [s]
     rate: Fraction  # frames per second
-    size: tuple[int, int]  # width and height as shown, that is after rotation [pixels]
+    size: tuple[int, int]  # width and height as shown, that is of square pixels, after rotation [pixels]
     rotation: int  # by which pictures are turned to be upright, counter-clockwise [degree], a multiple of 90
-    timecode: Timecode | None  # the label of its first frame; None where the file has none that can be used
-    timecode_fault: str | None  # what is wrong with the label that it has
+    before_key: int  # frames before the first key frame, which cannot be decoded and do not count
     sound: bool  # it has an audio track
     codec: str  # name of the video codec
     hdr: str | None  # name of a high-dynamic-range transfer function; None for the usual kind
@@ -64,10 +65,15 @@ class Film:
         return float(gaps.min()), float(gaps.max())
 
     @property
+    def jitter(self) -> float:
+        """How far intervals between frames usually are from the usual one [s]."""
+        return _jitter(np.diff(self.times))
+
+    @property
     def variable(self) -> bool:
-        """Whether intervals between frames vary by more than rounding."""
-        usual = 1 / float(self.rate)
-        return max(abs(gap - usual) for gap in self.intervals) > JITTER * usual + float(self.time_base)
+        """Whether a frame is further than half an interval from its place at a constant rate."""
+        places = (self.times - self.times[0]) * float(self.rate)
+        return bool(np.abs(places - np.arange(len(self))).max() > 0.5 + float(self.time_base * self.rate))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -88,23 +94,21 @@ def probe(path: Path) -> Film:
     try:
         with av.open(str(path)) as container:
             stream = _video_stream(path, container)
-            pts = _stamps(path, container, stream)
+            pts, before_key = _stamps(path, container, stream)
             time_base, declared = stream.time_base, stream.average_rate
             codec, sound = stream.codec_context.name, bool(container.streams.audio)
-            label, count = _timecode_label(container, stream)
+            aspect = Fraction(stream.sample_aspect_ratio or 1)
         with av.open(str(path)) as container:
             first = next(container.decode(_video_stream(path, container)), None)
     except (FFmpegError, OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as a film ({error}). Copy it again from the camera.") from error
     if first is None:
         raise DataError(f"{path}: no frame can be decoded. Copy it again from the camera.")
-    gaps = np.diff(pts) * float(time_base)
-    rate = _rate(gaps, declared, float(time_base))
-    timecode, fault = _timecode(label, count, rate)
+    rate = _rate(np.diff(pts) * float(time_base), declared, float(time_base))
     return Film(
-        path=path, pts=pts, time_base=time_base, rate=rate, size=_shown_size(path, first),
-        rotation=int(first.rotation) % 360, timecode=timecode,
-        timecode_fault=fault, sound=sound, codec=codec, hdr=HDR.get(int(first.color_trc)),
+        path=path, pts=pts, time_base=time_base, rate=rate, size=_shown_size(path, first, aspect),
+        rotation=int(first.rotation) % 360, before_key=before_key, sound=sound, codec=codec,
+        hdr=HDR.get(int(first.color_trc)),
     )  # fmt: skip
 
 
@@ -133,9 +137,40 @@ def pictures(film: Film) -> Iterator[tuple[int, av.VideoFrame]]:
 
 
 def upright(film: Film, frame: av.VideoFrame) -> np.ndarray:
-    """The picture as (H, W, 3) uint8 RGB, turned as the file asks for."""
+    """The picture as (H, W, 3) uint8 RGB of square pixels, turned as the file asks for."""
     turned = np.rot90(frame.to_ndarray(format="rgb24"), film.rotation // 90)
-    return np.ascontiguousarray(turned)
+    return resized(np.ascontiguousarray(turned), film.size)
+
+
+class FilmFrames:
+    """Frames of a film of a constant rate, read by their numbers; rising numbers are read in one pass."""
+
+    def __init__(self, path: Path) -> None:
+        """Reads the film's facts.
+
+        Raises:
+            DataError: it is unusable, or its rate varies.
+        """
+        self.facts = probe(path)
+        if self.facts.variable:
+            shortest, longest = (1000 * interval for interval in self.facts.intervals)
+            raise DataError(
+                f"{path}: its rate varies or frames are missing ({shortest:.1f} to {longest:.1f} ms between frames). "
+                "Bring it to a constant rate with `gausim prepare ingest`."
+            )
+        self._next = 0
+        self._frames: Iterator[tuple[int, av.VideoFrame]] = iter(())
+
+    def rgba(self, number: int) -> np.ndarray:
+        """Frame of this number, upright, (H, W, 4) uint8 opaque RGBA."""
+        if number < self._next or self._next == 0:
+            self._next, self._frames = 0, pictures(self.facts)
+        for index, frame in self._frames:
+            self._next = index + 1
+            if index == number:
+                rgb = upright(self.facts, frame)
+                return np.dstack((rgb, np.full(rgb.shape[:2], 255, np.uint8)))
+        raise DataError(f"{self.facts.path}: frame {number} cannot be decoded. Copy it again from the camera.")
 
 
 def sound(film: Film) -> tuple[np.ndarray, float]:
@@ -199,9 +234,9 @@ def _video_stream(path: Path, container: av.container.InputContainer) -> av.Vide
     raise DataError(f"{path}: holds no video stream.")
 
 
-def _stamps(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> np.ndarray:
-    """Time stamps of the frames that are shown, of a film that is whole."""
-    stamps, end = [], 0.0
+def _stamps(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> tuple[np.ndarray, int]:
+    """Time stamps of the frames that are shown, of a film that is whole, and how many come before a key frame."""
+    stamps, end, key = [], 0.0, None
     streams = [stream, *container.streams.audio[:1]]
     for packet in container.demux(streams):
         if packet.size == 0:
@@ -213,11 +248,13 @@ def _stamps(path: Path, container: av.container.InputContainer, stream: av.Video
                 raise DataError(f"{path}: its frames have no time stamps. Put them into an MP4, MOV or MKV file.")
             continue
         end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
-        if packet.stream_index == stream.index and not packet.is_discard:
-            stamps.append(packet.pts)
-    if len(stamps) < 2:
-        raise DataError(f"{path}: holds {len(stamps)} frames, expected at least 2.")
-    pts = np.sort(np.array(stamps, np.int64))
+        if packet.stream_index == stream.index:
+            key = packet.pts if key is None and packet.is_keyframe else key
+            stamps += [] if packet.is_discard else [packet.pts]
+    # A film that was cut without being coded again may begin between key frames; these frames build on others.
+    pts = np.array([stamp for stamp in sorted(stamps) if key is not None and stamp >= key], np.int64)
+    if len(pts) < 2:
+        raise DataError(f"{path}: holds {len(pts)} frames from its first key frame on, expected at least 2.")
     if (np.diff(pts) <= 0).any():
         raise DataError(f"{path}: several of its frames have one time stamp. Export it again.")
     declared = (container.duration or 0) / av.time_base
@@ -226,7 +263,12 @@ def _stamps(path: Path, container: av.container.InputContainer, stream: av.Video
             f"{path}: is cut off: it says that it lasts {declared:.3f} s, its data end at {end:.3f} s. Copy it again "
             "from the camera, or cut it to what is there with a video editor."
         )
-    return pts
+    return pts, len(stamps) - len(pts)
+
+
+def _jitter(gaps: np.ndarray) -> float:
+    apart = np.abs(gaps - np.median(gaps))
+    return float(np.quantile(apart[apart < MOST_JITTER * np.median(gaps)], 0.95))
 
 
 def _rate(gaps: np.ndarray, declared: Fraction | None, time_base: float) -> Fraction:
@@ -235,9 +277,12 @@ def _rate(gaps: np.ndarray, declared: Fraction | None, time_base: float) -> Frac
     Where frames are missing the usual gap tells the rate, not the mean.
     """
     span, count = float(gaps.sum()), len(gaps)
-    for rate in (declared, *STANDARD_RATES):
-        if rate and abs(count / float(rate) - span) <= 1.01 * time_base + RATE_TOLERANCE * span:
-            return Fraction(rate)
+    wrong = {rate: abs(count / float(rate) - span) for rate in (declared, *STANDARD_RATES) if rate}
+    exact, nearest = 1.01 * time_base + RATE_TOLERANCE * span, min(wrong, key=wrong.__getitem__)
+    if declared and wrong[declared] <= exact:
+        return Fraction(declared)
+    if wrong[nearest] <= exact + 2 * _jitter(gaps):
+        return Fraction(nearest)
     usual = 1 / float(np.median(gaps))
     nearest = min(STANDARD_RATES, key=lambda rate: abs(float(rate) / usual - 1))
     if abs(usual * span / count - 1) > MISSING and abs(1 / usual - 1 / float(nearest)) <= 1.01 * time_base:
@@ -245,7 +290,8 @@ def _rate(gaps: np.ndarray, declared: Fraction | None, time_base: float) -> Frac
     return Fraction(count / span).limit_denominator(100000)
 
 
-def _shown_size(path: Path, frame: av.VideoFrame) -> tuple[int, int]:
+def _shown_size(path: Path, frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
+    """Width and height after rotation, of pixels that are made square by more of them."""
     if frame.interlaced_frame:
         raise DataError(
             f"{path}: is interlaced. Deinterlace it (for example `ffmpeg -vf bwdif`) and ingest the result."
@@ -256,32 +302,5 @@ def _shown_size(path: Path, frame: av.VideoFrame) -> tuple[int, int]:
     a, b, _, c, d, *_ = (1, 0, 0, 0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32).tolist()
     if a * d < b * c:
         raise DataError(f"{path}: is to be mirrored by its metadata. Export it as it is to be seen.")
-    return (frame.height, frame.width) if frame.rotation % 180 else (frame.width, frame.height)
-
-
-def _timecode_label(container: av.container.InputContainer, stream: av.VideoStream) -> tuple[str | None, int | None]:
-    """The label that the file carries, and its frame number where a time code track has it."""
-    for track in container.streams.data:
-        label = track.metadata.get("timecode")
-        if label:
-            container.seek(0)
-            packet = next((p for p in container.demux(track) if p.size >= 4), None)
-            return label, None if packet is None else int.from_bytes(bytes(packet)[:4], "big")
-    for metadata in (stream.metadata, container.metadata):
-        for key, label in metadata.items():
-            if key.lower() == "timecode":
-                return label, None
-    return None, None
-
-
-def _timecode(label: str | None, count: int | None, rate: Fraction) -> tuple[Timecode | None, str | None]:
-    """The label at the rate that its own track counts (at 50 per second some cameras label by 25), or its fault."""
-    if label is None:
-        return None, None
-    found: list[tuple[Timecode | None, str | None]] = []
-    for divisor in (1, 2, 4):
-        try:
-            found.append((parse_timecode(label, rate / divisor), None))
-        except DataError as error:
-            found.append((None, str(error)))
-    return next((each for each in found if each[0] is not None and each[0].frame == count), found[0])
+    width, height = round(frame.width * max(aspect, 1)), round(frame.height / min(aspect, 1))
+    return (height, width) if frame.rotation % 180 else (width, height)

@@ -1,8 +1,7 @@
 """Time offset between two cameras, by the sound that both microphones recorded.
 
-Loudness over time (its logarithm, in a band that every camera records) gives candidates; generalised
-cross-correlation with phase transform (Knapp and Carter, 1976) on windows of the sound itself places them to a small
-part of a millisecond and tells them apart. Several windows along the film show whether the clocks run apart.
+Loudness over time (its logarithm, in a band that every camera records) tells where the recordings belong, and the
+correlation of the whitened sound itself (Knapp and Carter, 1976) places them to a small part of a millisecond.
 
 Sound travels 1 m in 2.9 ms: a microphone 3 m further away hears half a frame later at 50 frames per second. Keep the
 clap near the object and the microphones at the cameras about equally far from it.
@@ -13,9 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.fft import irfft, rfft
 from scipy.signal import butter, correlate, correlation_lags, find_peaks, sosfiltfilt
-from scipy.signal.windows import tukey
 
 from gausim.core import DataError
 
@@ -24,16 +22,14 @@ BAND = (150.0, 4000.0)
 ENVELOPE_RATE = 500
 # Candidates closer than this are one [s].
 APART = 0.05
-CANDIDATES = 8
-WINDOWS = 5
-WINDOW_SECONDS = 8.0
 # The two sounds must overlap by so much [s].
 LEAST_OVERLAP = 0.4
-# Peak of the phase transform over the standard deviation of the rest: noise reaches 5 on thousands of lags.
-SHARP, USABLE = 9.0, 6.0
+# Peak of the whitened correlation over the standard deviation of the rest: noise reaches 5 on thousands of lags.
+SHARP = 9.0
 # How much more the best candidate must stand out than the next: in sharpness, in likeness of loudness.
 CLEARER, LOUDER = 1.4, 1.2
 LIKE = 0.5
+CANDIDATES = 8
 
 
 @dataclass(frozen=True)
@@ -41,8 +37,7 @@ class Lag:
     """A measured difference of starts."""
 
     seconds: float  # by how much the second recording's start is later than the first's [s]
-    spread: float  # largest disagreement between parts of the film [s]
-    sharpness: float  # of the phase transform's peak, in standard deviations of the rest
+    sharpness: float  # of the whitened correlation's peak, in standard deviations of the rest
     likeness: float  # correlation coefficient of the loudness
 
 
@@ -53,30 +48,24 @@ def sound_lag(first: np.ndarray, second: np.ndarray, rate: int) -> Lag:
         DataError: one is silent, they are too short, or do not tell where they belong.
     """
     a, b = _band(first, rate, "the reference"), _band(second, rate, "it")
-    envelope_a, envelope_b = _loudness(a, rate), _loudness(b, rate)
-    scores, lags = _likeness(envelope_a, envelope_b)
-    distance = int(APART * ENVELOPE_RATE)
-    peaks, _ = find_peaks(np.concatenate([[-1.0], scores, [-1.0]]), distance=distance)
-    peaks = sorted(peaks - 1, key=lambda i: -scores[i])[:CANDIDATES]
-    if not peaks:
+    loud_a, loud_b = _loudness(a, rate), _loudness(b, rate)
+    scores, lags = correlate(loud_a, loud_b), correlation_lags(len(loud_a), len(loud_b))
+    least = int(LEAST_OVERLAP * ENVELOPE_RATE)
+    enough = (lags >= least - len(loud_b)) & (lags <= len(loud_a) - least)
+    scores, lags = scores[enough] / np.sqrt((loud_a**2).sum() * (loud_b**2).sum() + 1e-24), lags[enough]
+    peaks, _ = find_peaks(np.pad(scores, 1, constant_values=-1), distance=int(APART * ENVELOPE_RATE))
+    best = sorted(peaks - 1, key=lambda i: -scores[i])[:CANDIDATES]
+    if not best:
         raise DataError("its sound is as loud all the time; nothing tells where it belongs.")
-    return _clearest([Lag(*_refined(a, b, lags[i] / ENVELOPE_RATE, rate), float(scores[i])) for i in peaks])
-
-
-def _clearest(found: list[Lag]) -> Lag:
-    """The candidate that stands out, by the sound itself or by its loudness."""
-    sharp = max(found, key=lambda lag: lag.sharpness)
-    blunter = max((lag.sharpness for lag in found if abs(lag.seconds - sharp.seconds) > APART), default=0.0)
-    if sharp.sharpness >= SHARP and sharp.sharpness >= CLEARER * blunter:
-        return sharp
-    like = found[0]
-    less_like = max((lag.likeness for lag in found if abs(lag.seconds - like.seconds) > APART), default=0.0)
-    if like.likeness >= LIKE and like.likeness >= LOUDER * less_like:
-        return like
+    whitened = correlate(_white(a), _white(b))
+    found = [_placed(whitened, len(b), lags[i] / ENVELOPE_RATE, float(scores[i]), rate) for i in best]
+    for name, needed, clearer in (("sharpness", SHARP, CLEARER), ("likeness", LIKE, LOUDER)):
+        ranked = sorted(found, key=lambda lag: -getattr(lag, name))
+        values = [getattr(lag, name) for lag in ranked] + [0.0]
+        if values[0] >= max(needed, clearer * values[1]):
+            return ranked[0]
     raise DataError(
-        f"its sound does not tell where it belongs (sharpness {sharp.sharpness:.1f}, needed {SHARP:g} and {CLEARER:g} "
-        f"times the next, {blunter:.1f}; likeness of loudness {like.likeness:.2f}, needed {LIKE:g} and "
-        f"{LOUDER:g} times the next, {less_like:.2f})."
+        "its sound does not tell where it belongs: no place stands out, by the sound itself or by its loudness."
     )
 
 
@@ -102,51 +91,22 @@ def _loudness(samples: np.ndarray, rate: int) -> np.ndarray:
     return level - level.mean()
 
 
-def _likeness(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Correlation of two signals over all lags with enough overlap, relative to their common energy."""
-    products, lags = correlate(a, b, method="fft"), correlation_lags(len(a), len(b))
-    least = int(LEAST_OVERLAP * ENVELOPE_RATE)
-    enough = (lags >= least - len(b)) & (lags <= len(a) - least)
-    norm = np.sqrt((a**2).sum() * (b**2).sum())
-    return products[enough] / max(norm, 1e-12), lags[enough]
+def _white(samples: np.ndarray) -> np.ndarray:
+    """Sound with equal parts of all frequencies that are in it, so that its echoes do not hide its place."""
+    spectrum = rfft(samples)
+    size = np.abs(spectrum)
+    return irfft(np.where(size > 1e-3 * size.max(), spectrum / np.maximum(size, 1e-300) ** 0.5, 0), len(samples))
 
 
-def _refined(a: np.ndarray, b: np.ndarray, lag: float, rate: int) -> tuple[float, float, float]:
-    """The lag [s], its spread over windows [s], and the median sharpness, around a coarse lag [s]."""
-    shift = round(lag * rate)
-    begin, end = max(0, shift), min(len(a), len(b) + shift)
-    length = min(end - begin, int(WINDOW_SECONDS * rate))
-    starts = np.unique(np.linspace(begin, end - length, min(WINDOWS, (end - begin) // length)).astype(int))
-    reach = int(APART * rate)
-    parts = [_phase_peak(a[s : s + length], b[s - shift : s - shift + length], reach, rate) for s in starts]
-    # Silent windows say nothing: only those count that are about as sharp as the best.
-    sharpest = max(sharp for _, sharp in parts)
-    kept = [(delay, sharp) for delay, sharp in parts if sharp >= max(USABLE, 0.5 * sharpest)]
-    if not kept:
-        return lag, 0.0, sharpest
-    delays = np.array([delay for delay, _ in kept])
-    middle, spread = float(np.median(delays)), float(np.ptp(delays))
-    return (shift + middle) / rate, spread / rate, float(np.median([sharp for _, sharp in kept]))
-
-
-def _phase_peak(a: np.ndarray, b: np.ndarray, reach: int, rate: int) -> tuple[float, float]:
-    """Delay of ``a`` behind ``b`` [samples] within ±reach, to a fraction, and the peak's sharpness."""
-    size = next_fast_len(2 * len(a))
-    # Cut edges sound alike in every recording, so windows fade in and out, and only the band of the filter counts.
-    fade = tukey(len(a), 0.25)
-    cross = rfft(a * fade, size) * np.conj(rfft(b * fade, size))
-    magnitude = np.abs(cross)
-    frequency = rfftfreq(size, 1 / rate)
-    heard = (frequency >= BAND[0]) & (frequency <= BAND[1]) & (magnitude > 1e-6 * magnitude.max(initial=0.0))
-    weight = np.where(heard, 1 / np.maximum(magnitude, 1e-300), 0.0)
-    correlation = irfft(cross * weight, size)
-    around = correlation[np.arange(-reach, reach + 1) % size]
+def _placed(whitened: np.ndarray, length: int, lag: float, likeness: float, rate: int) -> Lag:
+    """A coarse lag [s], refined by the correlation around it."""
+    zero, reach = length - 1 + round(lag * rate), int(APART * rate)
+    low, high = max(0, zero - reach), min(len(whitened), zero + reach + 1)
+    around = whitened[low:high]
     top = int(np.argmax(around))
-    beside = np.abs(np.arange(len(around)) - top) > 0.001 * rate
-    noise = float(around[beside].std())
-    if not noise > 0:
-        return 0.0, 0.0
-    return top - reach + parabola_peak(around, top), float(around[top] / noise)
+    noise = float(around[np.abs(np.arange(len(around)) - top) > 0.001 * rate].std())
+    place = low + top + parabola_peak(around, top) - (length - 1)
+    return Lag(place / rate, float(around[top]) / max(noise, 1e-300), likeness)
 
 
 def parabola_peak(values: np.ndarray, top: int) -> float:

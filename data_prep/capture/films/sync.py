@@ -1,6 +1,6 @@
 """Several cameras' films on one clock, and the frames of each that belong together.
 
-``world time = time in the film + offset``. Offsets come from time code, sound, a flash, or the user; the output's
+``world time = time in the film + offset``. Offsets come from sound, a flash, or the user; the output's
 frames are those of a reference camera, and every other camera gives its nearest frame. What remains between a frame and
 its place is the residual; above half a frame there is a better frame, or none, and the films are refused.
 """
@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from data_prep.capture.films.film import SOUND_RATE, Film, pictures, sound
-from data_prep.capture.films.flash import Flash, brightness, flash_lag, flashes
+from data_prep.capture.films.flash import RESOLUTION, brightness, flash_lag, flashes
 from data_prep.capture.films.sound import sound_lag
 from gausim.core import DataError
 
-METHODS = ("timecode", "audio", "flash", "offsets")
+METHODS = ("audio", "flash", "offsets")
 LIMIT = 0.5
 # Rates are multiples of each other up to what quartz clocks differ by. 30 and 29.97 differ twice as much.
 SAME_RATE = 5e-4
@@ -53,31 +53,28 @@ class Alignment:
         return max(float(np.abs(r).max()) for r in self.residuals.values())
 
 
-def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float], shutter: float = 1.0) -> Offsets:
+def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float]) -> Offsets:
     """Offsets by a method, or by the first that applies.
 
     Args:
         films: by camera.
-        method: one of ``METHODS``, or ``auto``: time code, else sound, else a flash, else what is given.
+        method: one of ``METHODS``, or ``auto``: sound, else a flash, else what is given.
         given: by camera, offsets that the user states [s]; cameras that are not named have 0.
-        shutter: exposure as part of the frame interval, for flashes.
 
     Raises:
-        DataError: the method does not apply (which camera, why, and what to do), or two methods contradict each other.
+        DataError: the method does not apply (which camera, why, and what to do).
     """
     if len(films) == 1:
         zero = dict.fromkeys(films, 0.0)
         return Offsets("single", zero, zero, zero)
     if method != "auto":
-        return _by(method, films, given, shutter)
+        return _by(method, films, given)
     reasons = []
     for name in METHODS:
         try:
-            found = _by(name, films, given, shutter)
+            return _by(name, films, given)
         except DataError as error:
             reasons.append(f"{name}: {error}")
-            continue
-        return _checked_by_sound(films, found) if name == "timecode" else found
     raise DataError("nothing tells how these films belong together.\n  " + "\n  ".join(reasons))
 
 
@@ -119,16 +116,14 @@ def align(
     return best
 
 
-def _by(method: str, films: Mapping[str, Film], given: Mapping[str, float], shutter: float) -> Offsets:
-    if method == "timecode":
-        return _by_timecode(films)
+def _by(method: str, films: Mapping[str, Film], given: Mapping[str, float]) -> Offsets:
+    zero = dict.fromkeys(films, 0.0)
     if method == "audio":
         return _by_sound(films)
     if method == "flash":
-        return _by_flash(films, shutter)
+        return _by_flash(films)
     if not given:
         raise DataError("no offsets are given. Name them: --offsets cam_1=0.146,cam_2=-3f (seconds, or frames with f).")
-    zero = dict.fromkeys(films, 0.0)
     return Offsets("offsets", {**zero, **given}, zero, zero)
 
 
@@ -142,73 +137,38 @@ def _naming(name: str, films: Mapping[str, Film], base: str | None = None) -> It
         raise DataError(f"{name} ({films[name].path.name}){other}: {error}") from error
 
 
-def _by_timecode(films: Mapping[str, Film]) -> Offsets:
-    codes = {}
-    for name, film in films.items():
-        if film.timecode is None:
-            raise DataError(f"{name} ({film.path.name}): {film.timecode_fault or 'has no time code.'}")
-        codes[name] = film.timecode
-    base, reference = next(iter(films.items()))
-    seconds = {}
-    for name, film in films.items():
-        with _naming(name, films, base):
-            later = float(codes[name].seconds_after(codes[base]))
-        # The label is that of the first frame, wherever on the film's own clock that lies.
-        seconds[name] = later - float(film.times[0]) + float(reference.times[0])
-    resolution = {name: 0.5 / float(code.rate) for name, code in codes.items()}
-    note = "time code counts whole frames: between cameras that are not genlocked up to half a frame stays unknown"
-    return Offsets("timecode", seconds, dict.fromkeys(films, 0.0), resolution, (note,))
-
-
 def _by_sound(films: Mapping[str, Film]) -> Offsets:
     for name, film in films.items():
         if not film.sound:
             raise DataError(f"{name} ({film.path.name}): has no sound.")
     (base, reference), *others = films.items()
     first, begin = sound(reference)
-    seconds, spread, notes = {base: 0.0}, {base: 0.0}, []
+    seconds, notes = {base: 0.0}, []
     for name, film in others:
         second, begins = sound(film)
         with _naming(name, films, base):
             lag = sound_lag(first, second, SOUND_RATE)
-        seconds[name], spread[name] = lag.seconds + begin - begins, lag.spread
+        seconds[name] = lag.seconds + begin - begins
         notes.append(f"{name}: sharpness {lag.sharpness:.1f}, likeness of loudness {lag.likeness:.2f}")
     notes.append("sound travels 1 m in 2.9 ms: a microphone that is further from the source hears later")
-    return Offsets("audio", seconds, spread, dict.fromkeys(films, 1 / SOUND_RATE), tuple(notes))
+    return Offsets("audio", seconds, dict.fromkeys(films, 0.0), dict.fromkeys(films, 1 / SOUND_RATE), tuple(notes))
 
 
-def _by_flash(films: Mapping[str, Film], shutter: float) -> Offsets:
-    found: dict[str, list[Flash]] = {}
+def _by_flash(films: Mapping[str, Film]) -> Offsets:
+    found: dict[str, list[float]] = {}
     for name, film in films.items():
         with _naming(name, films):
             levels = np.full(len(film), np.nan)
             for i, frame in pictures(film):
                 levels[i] = brightness(frame.to_ndarray(format="gray"))
-            found[name] = flashes(levels, film.times, interval=1 / float(film.rate), shutter=shutter)
+            found[name] = flashes(levels, film.times, interval=1 / float(film.rate))
     (base, reference), *others = films.items()
-    seconds, spread, resolution = {base: 0.0}, {base: 0.0}, {base: 0.0}
+    seconds, spread = {base: 0.0}, {base: 0.0}
     for name, film in others:
         with _naming(name, films, base):
             interval = 1 / float(min(film.rate, reference.rate))
-            seconds[name], spread[name], resolution[name] = flash_lag(found[base], found[name], interval=interval)
-    return Offsets("flash", seconds, spread, resolution)
-
-
-def _checked_by_sound(films: Mapping[str, Film], found: Offsets) -> Offsets:
-    """Time code that the sound contradicts was not jam-synced: neither is believed."""
-    try:
-        heard = _by_sound(films)
-    except DataError as error:
-        return replace(found, notes=(*found.notes, f"sound: {error}"))
-    apart = {name: (heard.seconds[name] - found.seconds[name]) * float(film.rate) for name, film in films.items()}
-    for name, film in films.items():
-        if abs(apart[name]) > 1.0:
-            raise DataError(
-                f"{name} ({film.path.name}): its time code and its sound disagree by {apart[name]:+.2f} frames. If the "
-                "cameras' time codes were set together, choose --sync timecode; if they were not, choose --sync audio."
-            )
-    told = {name: round(frames, 2) for name, frames in apart.items()}
-    return replace(found, notes=(*found.notes, f"sound agrees with the time code, later by {told} frames"))
+            seconds[name], spread[name] = flash_lag(found[base], found[name], interval=interval)
+    return Offsets("flash", seconds, spread, {name: RESOLUTION / float(film.rate) for name, film in films.items()})
 
 
 def _check_agreement(films: Mapping[str, Film], offsets: Offsets, rate: float) -> None:
@@ -223,9 +183,9 @@ def _check_agreement(films: Mapping[str, Film], offsets: Offsets, rate: float) -
 
 
 def _step(name: str, film: Film, rate: Fraction) -> int:
-    ratio = float(film.rate / rate)
+    ratio, unsure = float(film.rate / rate), 2 * film.jitter / float(film.times[-1] - film.times[0])
     step = round(ratio)
-    if step < 1 or abs(ratio / step - 1) > SAME_RATE:
+    if step < 1 or abs(ratio / step - 1) > SAME_RATE + unsure:
         raise DataError(
             f"{name} ({film.path.name}): {float(film.rate):.6g} frames per second are no whole multiple of the "
             f"output's {float(rate):.6g}. Film all cameras at one rate, or at multiples of one, or "
@@ -316,7 +276,6 @@ def facts(film: Film, name: str, offsets: Offsets, alignment: Alignment) -> dict
         "size": list(film.size),
         "rotation": film.rotation,
         "codec": film.codec,
-        "timecode": film.timecode.text if film.timecode else None,
         "offset_seconds": offsets.seconds[name] - offsets.seconds[alignment.reference],
         "offset_frames": (offsets.seconds[name] - offsets.seconds[alignment.reference]) * float(film.rate),
         "resolution_frames": offsets.resolution[name] * float(film.rate),

@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from data_prep.capture.masks.clips import Clip, read_picture, sampled, write_picture
+from data_prep.capture.masks.clips import Clip, sampled
+from data_prep.common.photos import read_picture, write_picture
 from gausim.io.files import replacing
 
 OUTLINE = (255, 40, 120)

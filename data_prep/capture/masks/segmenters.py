@@ -10,7 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from data_prep.capture.masks.clips import Clip, read_picture, sampled
+from data_prep.capture.masks.clips import Clip, sampled
+from data_prep.common.photos import read_picture
 from gausim.core import DataError
 
 MaskOf = Callable[[int], np.ndarray]
@@ -43,7 +44,7 @@ def alpha_masks(clip: Clip) -> MaskOf:
     """The alpha channel that the pictures have already; a picture without any transparency is refused."""
 
     def mask(index: int) -> np.ndarray:
-        alpha = clip.rgba(index)[..., 3]
+        alpha = read_picture(clip.file(index))[..., 3]
         if alpha.min() == 255:
             raise DataError(
                 f"{clip.file(index)}: has no transparent pixel, so its alpha is no mask. Choose another --backend."

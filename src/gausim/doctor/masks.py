@@ -73,7 +73,7 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
     spread = float(np.median([rim.std(0).max() for rim in rims]))
     hue = float(np.median([np.ptp(rim.mean(0)) for rim in rims]))
     looks = "uniform" if spread < _UNIFORM else "not uniform"
-    backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend sam2"
+    backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend masks"
     return Finding(
         "fault", "certain",
         f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background, which is "

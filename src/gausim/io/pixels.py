@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Tag of the sub-directory of EXIF data.
-_EXIF = 0x8769
+# Tags of the EXIF standard: its sub-directory, and how the picture is to be turned; a quarter by these.
+_EXIF, ORIENTATION = 0x8769, 0x0112
+QUARTER_TURNS = (5, 6, 7, 8)
 
 
 def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
@@ -31,6 +32,36 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
         return cv2.imread(str(path), flags)
     except (cv2.error, MemoryError):
         return None
+
+
+def palette_indices(path: Path) -> np.ndarray | None:
+    """(H, W) numbers of the colours of a picture that has a palette without transparency; None for other pictures."""
+    return _opened(path, lambda image: np.asarray(image) if _has_palette(image) else None)
+
+
+def decode_tiff(path: Path) -> np.ndarray | None:
+    """(H, W, 3) BGR or (H, W, 4) BGRA of a TIFF that is to be turned, as stored; OpenCV cannot read these."""
+
+    def read(image: Image) -> np.ndarray:
+        orientation = image.getexif().get(ORIENTATION) or 1  # Pillow turns a TIFF when it loads it
+        pixels = np.asarray(image.convert("RGBA" if "A" in image.mode else "RGB"))
+        stored = exif_turned(pixels, {6: 8, 8: 6}.get(orientation, orientation))
+        return np.ascontiguousarray(stored[..., [2, 1, 0, 3][: stored.shape[2]]])
+
+    return _opened(path, read)
+
+
+def exif_turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """A stored picture (H, W, C) as its EXIF orientation turns it."""
+    turns: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+        2: lambda p: p[:, ::-1], 3: lambda p: p[::-1, ::-1], 4: lambda p: p[::-1], 5: lambda p: p.swapaxes(0, 1),
+        6: lambda p: np.rot90(p, -1), 7: lambda p: p[::-1, ::-1].swapaxes(0, 1), 8: np.rot90,
+    }  # fmt: skip
+    return np.ascontiguousarray(turns[orientation](pixels)) if orientation in turns else pixels
+
+
+def _has_palette(image: Image) -> bool:
+    return image.mode == "P" and "transparency" not in image.info
 
 
 @dataclass(frozen=True)
@@ -66,7 +97,10 @@ def _opened(path: Path, read: Callable[[Image], T]) -> T | None:
 
 def _header(image: Image) -> ImageHeader:
     tags = image.getexif()
-    return ImageHeader(image.width, image.height, image.mode, {**tags, **tags.get_ifd(_EXIF)})
+    # Pillow tells the size of a TIFF after the turn.
+    swapped = image.format == "TIFF" and tags.get(ORIENTATION) in QUARTER_TURNS
+    width, height = (image.height, image.width) if swapped else (image.width, image.height)
+    return ImageHeader(width, height, image.mode, {**tags, **tags.get_ifd(_EXIF)})
 
 
 def _is_whole(image: Image) -> bool:

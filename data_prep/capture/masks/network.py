@@ -30,6 +30,12 @@ class NetworkOptions(Options):
     onnx_output: int = option(0, "which output is the mask (%(default)s)", least=0)
     onnx_activation: str = option("none", "what makes it 0..1 (%(default)s)", choices=ACTIVATIONS)
 
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        super().__post_init__()
+        if not {len(self.onnx_mean), len(self.onnx_scale)} <= {1, 3} or 0 in self.onnx_scale:
+            raise ConfigError("--onnx-mean, --onnx-scale: expected one or three numbers, scales other than 0.")
+
 
 class OnnxSegmenter:
     """Any network that maps one picture, (1, 3, H, W) float32, to one map of saliency."""
@@ -45,25 +51,19 @@ class OnnxSegmenter:
             import onnxruntime
         except ImportError as error:
             raise ConfigError("onnxruntime runs this backend. Install it: `pip install 'gausim[segment]'`.") from error
-        path = options.onnx
-        if path is None or not path.is_file():
-            raise DataError(f"{path}: no such network.")
+        self._path, self._options = options.onnx, options
+        if self._path is None or not self._path.is_file():
+            raise DataError(f"{self._path}: no such network.")
         session = onnxruntime.SessionOptions()
         session.intra_op_num_threads = int(os.environ.get("OMP_NUM_THREADS") or 0)
         session.log_severity_level = 3
         try:
-            self._session = onnxruntime.InferenceSession(str(path), session, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(str(self._path), session, providers=["CPUExecutionProvider"])
         except Exception as error:  # its exceptions have no common base
-            raise DataError(f"{path}: cannot be loaded as an ONNX network ({error}).") from error
-        mean, scale = options.onnx_mean, options.onnx_scale
-        self._path, self._output, self._activation = path, options.onnx_output, options.onnx_activation
-        self._mean, self._scale = np.asarray(mean, np.float32), np.asarray(scale, np.float32)
+            raise DataError(f"{self._path}: cannot be loaded as an ONNX network ({error}).") from error
         self._size = self._input_size(options.onnx_size)
-        outputs = self._session.get_outputs()
-        if self._output >= len(outputs):
-            raise ConfigError(f"{path}: has outputs 0 to {len(outputs) - 1}, asked for {self._output}.")
-        if len(mean) not in (1, 3) or len(scale) not in (1, 3) or 0 in scale:
-            raise ConfigError(f"{path}: expected one or three means and scales that are not 0; got {mean}, {scale}.")
+        if options.onnx_output >= (count := len(self._session.get_outputs())):
+            raise ConfigError(f"{self._path}: has outputs 0 to {count - 1}, asked for {options.onnx_output}.")
 
     def open(self, clip: Clip) -> MaskOf:
         """See :class:`data_prep.capture.masks.segmenters.Backend`."""
@@ -75,46 +75,44 @@ class OnnxSegmenter:
         Raises:
             DataError: the network fails, or gives no map of numbers in 0..1.
         """
-        height, width = rgb.shape[:2]
+        options, (height, width) = self._options, rgb.shape[:2]
         values = cv2.resize(rgb, self._size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
-        values = np.ascontiguousarray(((values - self._mean) / self._scale).transpose(2, 0, 1)[None], np.float32)
-        name = self._session.get_inputs()[0].name
+        values = (values - np.array(options.onnx_mean, np.float32)) / np.array(options.onnx_scale, np.float32)
+        values = np.ascontiguousarray(values.transpose(2, 0, 1)[None], np.float32)
+        name, output = self._session.get_inputs()[0].name, self._session.get_outputs()[options.onnx_output].name
         try:
-            found: Any = self._session.run([self._session.get_outputs()[self._output].name], {name: values})[0]
+            found: Any = self._session.run([output], {name: values})[0]
         except Exception as error:  # its exceptions have no common base
             raise DataError(f"{self._path}: fails on an input of {values.shape} ({error}). Try --onnx-size.") from error
-        saliency = np.asarray(found, np.float32).squeeze()
-        if saliency.ndim != 2 or not np.isfinite(saliency).all():
+        map_ = np.asarray(found, np.float32).squeeze()
+        if map_.ndim != 2 or not np.isfinite(map_).all():
             raise DataError(
-                f"{self._path}: output {self._output} has shape {np.shape(found)}"
-                f"{'' if np.isfinite(saliency).all() else ' and values that are no numbers'}, expected one map of "
-                "finite numbers. Choose another with --onnx-output."
+                f"{self._path}: output {options.onnx_output} of shape {np.shape(found)} is no map of finite numbers. "
+                "Choose another with --onnx-output."
             )
-        return cv2.resize(self._activated(saliency), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
+        return cv2.resize(self._activated(map_), (width, height), interpolation=cv2.INTER_LINEAR).clip(0, 1)
 
     def _activated(self, saliency: np.ndarray) -> np.ndarray:
-        if self._activation == "sigmoid":
+        if self._options.onnx_activation == "sigmoid":
             return np.asarray(1 / (1 + np.exp(-saliency.clip(-60, 60))), np.float32)
         low, high = float(saliency.min()), float(saliency.max())
-        if self._activation == "minmax":
+        if self._options.onnx_activation == "minmax":
             return (saliency - low) / max(high - low, 1e-6)
         if low < -0.01 or high > 1.01:
             raise DataError(
-                f"{self._path}: output {self._output} has values of {low:.3g} to {high:.3g}, expected 0 to 1. Try "
+                f"{self._path}: its output has values of {low:.3g} to {high:.3g}, expected 0 to 1. Try "
                 "--onnx-activation sigmoid, or another --onnx-output."
             )
         return saliency
 
     def _input_size(self, size: int | None) -> tuple[int, int]:
         """Width and height of the input."""
-        inputs = self._session.get_inputs()
-        shape = inputs[0].shape
-        if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
-            found = [(i.name, i.type, i.shape) for i in inputs]
+        given = self._session.get_inputs()
+        shape = given[0].shape
+        if len(given) != 1 or len(shape) != 4 or shape[1] != 3 or given[0].type != "tensor(float)":
+            found = [(i.name, i.type, i.shape) for i in given]
             raise DataError(f"{self._path}: expected one input of float32, [1, 3, H, W]; got {found}.")
         height, width = (n if isinstance(n, int) and n > 0 else size for n in shape[2:])
-        if not height or not width:
-            raise ConfigError(f"{self._path}: leaves the size of its input open ({shape}). State it with --onnx-size.")
-        if size and (height, width) != (size, size):
-            raise ConfigError(f"{self._path}: its input is {width}x{height}, --onnx-size says {size}.")
+        if not height or not width or (size and (height, width) != (size, size)):
+            raise ConfigError(f"{self._path}: its input is {shape}, --onnx-size is {size}. State a size that fits.")
         return width, height
