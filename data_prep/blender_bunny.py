@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("--mesh", type=Path, required=True, metavar="FILE", help="surface of the object, OBJ or PLY")
     add("--out", type=Path, metavar="DIR", help="where to (default: data/NAME)")
-    add("--force", action="store_true", help="replace a set of other settings")
+    add("--overwrite", dest="force", action="store_true", help="replace a set of other settings")
     add("--quick", action="store_true", help="2 sequences of 8 small frames, 4 views, 6 stills")
     group = parser.add_argument_group("sizes and motion", "Defaults are the paper's.")
     for kind in (Plan, Pictures, Soft):

@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = stage_parser("synthesize", __doc__, result=False)
     add = parser.add_argument
     add("--out", type=Path, default=Path("data/synthetic"), help="folder of the set (%(default)s)")
-    add("--force", action="store_true", help="replace a set of other settings")
+    add("--overwrite", dest="force", action="store_true", help="replace a set of other settings")
     add("--quick", action="store_true", help="a tiny set, for tests")
     add("--workers", type=int, default=cores(), help="processes (%(default)s)")
     add_options(parser, Plan, unset=True)

@@ -92,7 +92,7 @@ def played(_played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> SimpleN
     # All who name it at their top are imported before it is replaced at home.
     names = ("cli.inspect_material", "cli.simulate_run", "cli.evaluate_run", "cli.training_run", "api", "compose.build")
     for home in names:
-        monkeypatch.setattr(f"gausim.{home}.load_run", lambda path, data=None: _played)
+        monkeypatch.setattr(f"gausim.{home}.load_run", lambda path, **_: _played)
     return _played
 
 

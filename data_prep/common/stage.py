@@ -106,7 +106,7 @@ def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
         manifest: dict[str, Any] = parse_json(path.read_bytes())
         found = manifest["stage"]
     except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not the manifest of a stage ({error}). Make the stage again with --force.") from error
+        raise DataError(f"{path}: not the manifest of a stage ({error}). Make it again with --overwrite.") from error
     if stage is not None and found != stage:
         raise DataError(f"{path}: stage is '{found}', expected '{stage}'.")
     return manifest
@@ -173,7 +173,7 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
     if different and not force:
         raise DataError(
             f"{out / MANIFEST}: a result of other {', '.join(different)} is there. Choose another --out, or replace "
-            "it with --force."
+            "it with --overwrite."
         )
     return None if different else manifest
 

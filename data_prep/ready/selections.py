@@ -115,7 +115,7 @@ def _term(words: list[str], text: str, files: list[Path]) -> Selection:
         case ["all"]:
             return HalfSpace(0)
         case ["below" | "above" as side, place]:
-            half = parse_half_space(place, above=side == "above")
+            half = parse_half_space(f"{side} {place}")
             if not math.isfinite(half.above if half.above is not None else half.below or 0.0):
                 raise _wrong(text, f"'{place}' is not finite")
             return half

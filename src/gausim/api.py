@@ -163,6 +163,7 @@ def load(
     most_force: float | None = None,
     keep: int | None = None,
     data: Mapping[str, Any] | None = None,
+    device: str = "auto",
 ) -> Simulation:
     """Loads an object of a trained run.
 
@@ -174,12 +175,14 @@ def load(
         most_force: the largest force [weights]; 10 when None.
         keep: number of latest frames kept for the trajectory; None keeps all.
         data: keys of the run's data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
+        device: ``auto`` (the GPU where there is one), ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
+        ConfigError: there is no such device.
         RunError: there is no run, or its scene differs from the one it was trained on.
         DataError: the object or sequence does not exist.
     """
-    loaded = load_run(run, data=data)
+    loaded = load_run(run, data=data, device=device)
     interaction = open_interaction(
         loaded, name=object, sequence=sequence, gravity=gravity, most_force=most_force, keep=keep
     )

@@ -43,7 +43,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pu
     assert ratios[-1] < 0.9 * ratios[0]
     told = json.loads((out / "evaluation" / "metrics.json").read_text())["objects"]["toy"]["rows"]
     assert told["gausim"]["seen"]["train"]["l2"]["mean"] > 0
-    videos = ["--out", str(tmp_path / "videos"), "--frames", "2", "--view", "cam_0"]
+    videos = ["--out", str(tmp_path / "videos"), "--frames", "2", "--cameras", "cam_0"]
     assert simulate.main([str(out), *videos]) == 0
 
 

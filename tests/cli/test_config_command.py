@@ -170,8 +170,8 @@ def test_what_is_no_configuration(what: list[str], message: str, tmp_path, monke
     [
         ("ev", {"evaluate"}),
         ("--v", {"--version"}),
-        ("evaluate --vi", {"--views"}),
-        ("evaluate RUN --views ", {"all", "train", "heldout"}),
+        ("evaluate --cam", {"--cameras"}),
+        ("evaluate RUN --cameras ", {"all", "train", "heldout"}),
         ("evaluate RUN --out ", set()),  # files, which the shell knows better
         ("nonsense ", set()),
         ("config ", {"validate", "schema", "completion"}),
@@ -224,7 +224,7 @@ def test_the_script_in_bash(tmp_path: Path, capsys) -> None:
     breaks = " \t\n\"'><=;|&(:"
     for line, where, expected in (
         ("gausim eval", breaks, ["evaluate"]),
-        ("gausim evaluate RUN --views ", breaks, ["all", "train", "heldout"]),
+        ("gausim evaluate RUN --cameras ", breaks, ["all", "train", "heldout"]),
         # Readline has `model` and `=` behind it already, unless = breaks no words.
         ("gausim train model=gausim_p", breaks, ["gausim_paper"]),
         ("gausim train model=gausim_p", " \t\n", ["model=gausim_paper"]),

@@ -36,7 +36,7 @@ def run(toy, tmp_path, monkeypatch):
 
     loaded = stand_in(tmp_path / "run", toy.root, model=model, initial_states=initial, predict=predict)
     for home in (evaluate_run, simulate_run, build):
-        monkeypatch.setattr(home, "load_run", lambda path, data=None: loaded)
+        monkeypatch.setattr(home, "load_run", lambda path, **_: loaded)
     return loaded
 
 
@@ -59,7 +59,7 @@ def test_whole_evaluation(run, capsys):
 
 
 def test_a_part_does_not_overwrite_the_whole(run, capsys):
-    assert evaluate.main([str(run.run_dir), "--sequences", "seq_001", "--views", "heldout", "--json"]) == 0
+    assert evaluate.main([str(run.run_dir), "--sequences", "seq_001", "--cameras", "heldout", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["objects"]["toy"]["sequences"] == ["seq_001"]
     assert set(printed["objects"]["toy"]["rows"]["static"]["seen"]) == {"heldout", "points"}
@@ -99,7 +99,7 @@ def test_a_sequence_gives_all_files(run, capsys):
 
 
 def test_more_frames_than_were_recorded_of_all_sequences(run):
-    options = ["--sequence", "all", "--view", "cam_1", "--frames", "26", "--out", str(run.run_dir / "out")]
+    options = ["--sequences", "all", "--cameras", "cam_1", "--frames", "26", "--out", str(run.run_dir / "out")]
     assert simulate.main([str(run.run_dir), *options, "--background", "white", "--brighten", "1.2"]) == 0
     assert {p.name for p in (run.run_dir / "out" / "toy").iterdir()} == {"seq_000", "seq_001"}
     folder = run.run_dir / "out" / "toy" / "seq_001"
@@ -111,10 +111,10 @@ def test_more_frames_than_were_recorded_of_all_sequences(run):
 @pytest.mark.parametrize(
     ("command", "asked", "error", "message"),
     [
-        (evaluate.main, ["--object", "cat"], DataError, r"no object \['cat'\]; it has \['toy'\]"),
+        (evaluate.main, ["--objects", "cat"], DataError, r"no object \['cat'\]; it has \['toy'\]"),
         (evaluate.main, ["--sequences", "seq_7"], DataError, "no sequence .*seq_7"),
-        (simulate.main, ["--sequence", "seq_9"], DataError, "seq_9"),
-        (simulate.main, ["--view", "cam_9"], DataError, "cam_9"),
+        (simulate.main, ["--sequences", "seq_9"], DataError, "seq_9"),
+        (simulate.main, ["--cameras", "cam_9"], DataError, "cam_9"),
         (simulate.main, ["--background", "mauve"], ConfigError, "--background mauve"),
     ],
 )

@@ -31,7 +31,7 @@ def run(played: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, capsys) -> None:
     scene, source = run.module.model.scenes[0], str(run.run_dir)
-    options = ["--sequence", "seq_001", "--frames", "6"]
+    options = ["--sequences", "seq_001", "--frames", "6"]
     assert export.main([source, "--format", "safetensors", *options]) == 0
     assert "wrote toy_seq_001.safetensors: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
     trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.predict(1, 5)
@@ -74,7 +74,7 @@ def test_usd(run) -> None:
 
 def test_pictures(run) -> None:
     source, short = str(run.run_dir), ["--frames", "2"]
-    assert export.main([source, "--format", "mp4", *short, "--view", "cam_1", "--out", "v.mp4"]) == 0
+    assert export.main([source, "--format", "mp4", *short, "--cameras", "cam_1", "--out", "v.mp4"]) == 0
     shown = list(read_video("v.mp4"))
     assert len(shown) == 2 and shown[0].shape == (32, 32, 3) and shown[0].max() > 60
     # A trajectory's frames are drawn as the run draws them: deformed scenes are the same Gaussians.
@@ -98,7 +98,7 @@ def test_a_compact_motion_and_its_page(run, capsys) -> None:
     assert export.main([source, "--format", "motion", "--frames", "6", "--every", "2"]) == 0
     assert "wrote toy_seq_000.motion.glb: 3 frames of 36 kernels at 12 frames" in capsys.readouterr().out
     GlbFile(Path("toy_seq_000.motion.glb")).check_splats(run.module.model.scenes[0], degree=0)
-    assert export.main([source, "--format", "html", "--frames", "6", "--view", "cam_1"]) == 0
+    assert export.main([source, "--format", "html", "--frames", "6", "--cameras", "cam_1"]) == 0
     record, page = run.objects[0].sequences[0], Path("toy_seq_000.html").read_text()
     eye = json.loads(page.split('id="settings">')[1].split("<")[0])["camera"]["eye"]
     assert eye == pytest.approx(record.cameras_of(["cam_1"]).centers[0].tolist(), abs=1e-6)
@@ -114,9 +114,9 @@ def test_frames_as_gltf(run) -> None:
 @pytest.mark.parametrize(
     ("argv", "error", "message"),
     [
-        (["RUN", "--format", "gif", "--view", "cam_9"], DataError, "--view cam_9: expected one of .'cam_0'"),
-        (["RUN", "--format", "ply", "--sequence", "x"], DataError, "has no sequence 'x'"),
-        (["RUN", "--format", "ply", "--object", "x"], DataError, "has no object"),
+        (["RUN", "--format", "gif", "--cameras", "cam_9"], DataError, "--cameras cam_9: expected one of .'cam_0'"),
+        (["RUN", "--format", "ply", "--sequences", "x"], DataError, "has no sequence 'x'"),
+        (["RUN", "--format", "ply", "--objects", "x"], DataError, "has no object"),
         (["RUN", "--format", "usd", "--out", "m.txt"], ConfigError, "ends in .usd"),
         (["t.safetensors", "--format", "ply"], ConfigError, "name its rest scene with --scene"),
         (["t.safetensors", "--format", "ply", "--scene", "s.ply"], DataError, "t.safetensors: no such file"),

@@ -113,7 +113,7 @@ def test_a_fetched_run_names_what_it_misses_and_works_with_it(
     run = Path("outputs/fetched/made")
     with pytest.raises(DataError, match="field data.root names .*, expected a directory, .* --data DIR"):
         simulate.main([str(run)])
-    assert simulate.main([str(run), "--data", "toy_moved", "--frames", "3", "--view", "cam_0"]) == 0
+    assert simulate.main([str(run), "--data", "toy_moved", "--frames", "3", "--cameras", "cam_0"]) == 0
     assert load_run(run, data={"root": "toy_moved"}).objects[0].scene_path == run / "scenes" / "scene.ply"
 
 

@@ -72,7 +72,7 @@ def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) 
     name = {"linear_tracks": "linear AR(2) on tracked motion"}.get(model, model)
     assert row.startswith(name) and row in entry["rows"] and notes
     assert all(note in (run / "evaluation" / "table.md").read_text() for note in notes)
-    assert simulate.main([str(run), "--frames", "12", "--view", "cam_0"]) == 0
+    assert simulate.main([str(run), "--frames", "12", "--cameras", "cam_0"]) == 0
     assert report.main([str(run), "--out", "page", "--no-pictures"]) == 0
     written = "".join(p.read_text() for p in Path("page").iterdir() if p.suffix == ".md").replace("\\", "")
     assert model in written and ("Does not foresee" in written) == (model == "deformation_field")

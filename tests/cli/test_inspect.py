@@ -34,7 +34,7 @@ def inspect(scene_file: Path, capsys: pytest.CaptureFixture[str], *options: str)
 
 
 def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = inspect(scene_file, capsys, "--pin-below", "z=0.1", "--radii", "0.3", "0.7", "--save-masks")
+    text = inspect(scene_file, capsys, "--pin", "below z=0.1", "--radii", "0.3", "0.7", "--save-masks")
     lines = {line.split()[0]: line for line in text.splitlines() if line}
     assert lines["kernels"].split() == ["kernels", "60"] and lines["SH"].split()[-1] == "1"
     assert "z 0 .. 2" in lines["box"] and "pinned 12" in text
@@ -54,12 +54,12 @@ def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixtu
 def test_up_points_away_from_the_pins_unless_given(scene_file: Path, monkeypatch, more: list[str], down: bool) -> None:
     drawn: list[bool] = []
     monkeypatch.setattr(kernels, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
-    assert main(["inspect", str(scene_file), "--pin-above", "z=1.9", *more]) == 0
+    assert main(["inspect", str(scene_file), "--pin", "above z=1.9", *more]) == 0
     assert drawn == [down]
 
 
 def test_simulated_half(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--simulate-below", "x=0.5", "--pin-below", "z=0.1", "--radii", "0.5"]
+    options = ["--simulate", "below x=0.5", "--pin", "below z=0.1", "--radii", "0.5"]
     assert "simulated 30  pinned 6" in inspect(scene_file, capsys, *options)
 
 
@@ -67,9 +67,9 @@ def test_simulated_half(scene_file: Path, capsys: pytest.CaptureFixture[str]) ->
     ("arguments", "needle"),
     [
         ([], "no kernel is pinned"),
-        (["--pin-below", "z=-5"], "holds none of 60 kernels"),
-        (["--pin-below", "height=3"], "AXIS=VALUE"),
-        (["--pin-below", "z=0.1", "--radii", "40"], "--radii"),
+        (["--pin", "below z=-5"], "holds none of 60 kernels"),
+        (["--pin", "below height=3"], "AXIS=VALUE"),
+        (["--pin", "below z=0.1", "--radii", "40"], "--radii"),
         (["--masks", "absent.npz"], "absent.npz: no such file"),
     ],
 )

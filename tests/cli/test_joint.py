@@ -38,7 +38,7 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
         assert bool(own.detach().any())  # each has learned
     assert [o.sequences[0].cameras.width for o in run.objects] == [32, 24]
     assert [int(s.pinned.sum()) for s in simulator.scenes] == [9, 9]  # the second store's own selection, 15 without
-    assert evaluate.main([str(joint), "--views", "train", "--out", str(tmp_path)]) == 0
+    assert evaluate.main([str(joint), "--cameras", "train", "--out", str(tmp_path)]) == 0
     objects = json.loads((tmp_path / "metrics.json").read_text())["objects"]
     assert {name: o["splits"]["seen"] for name, o in objects.items()} == {"toy": [0, 8], "other": [0, 6]}
     errors = [o["rows"]["gausim"]["seen"]["train"]["l2"]["mean"] for o in objects.values()]

@@ -133,7 +133,7 @@ def test_looks_are_declared_counted_and_said(
     with pytest.raises(DataError, match=r"\['seq_001'\] belong to the test part, which is evaluated with --test"):
         evaluate.main([str(run), "--sequences", "seq_001"])
     with pytest.raises(DataError, match="belongs to the test part"):
-        simulate.main([str(run), "--sequence", "seq_001", "--out", str(run / "film")])
+        simulate.main([str(run), "--sequences", "seq_001", "--out", str(run / "film")])
     assert not (run / "evaluation" / "test.json").exists()
 
     assert evaluate.main([str(run), "--test", "--trials", "5"]) == 0

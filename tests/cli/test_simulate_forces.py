@@ -47,7 +47,7 @@ def same(a: Path, b: Path) -> bool:
 def test_forces_write_files_and_their_session_replays_them(played, tmp_path: Path, capsys) -> None:
     words = ["--force", "on=tip", "weights=3", "direction=x", "at=2", "frames=4", "--wind", "weights=0.5",
              "direction=0,1,0", "gusts=0.5", "--pin", "on=kernels:3", "at=6"]  # fmt: skip
-    options = ["--frames", "8", "--view", "cam_1", "--background", "white"]
+    options = ["--frames", "8", "--cameras", "cam_1", "--background", "white"]
     assert simulate.main([str(played.run_dir), *words, *options, "--gif", "--out", str(tmp_path / "a")]) == 0
     folder = tmp_path / "a" / "toy" / "forces"
     names = {"trajectory.safetensors", "session.json", "cam_1.mp4", "cam_1.gif", "cam_1_sheet.png"}
@@ -69,7 +69,7 @@ def test_forces_write_files_and_their_session_replays_them(played, tmp_path: Pat
     shown = list(read_video(folder / "cam_1.mp4"))
     assert len(shown) == 8 and (shown[3] != shown[0]).mean() > 0.01
 
-    again = [str(played.run_dir), "--session", str(folder / "session.json"), "--view", "cam_1"]
+    again = [str(played.run_dir), "--session", str(folder / "session.json"), "--cameras", "cam_1"]
     assert simulate.main([*again, "--out", str(tmp_path / "b")]) == 0
     assert "warning" not in capsys.readouterr().err
     assert same(folder / "trajectory.safetensors", tmp_path / "b" / "toy" / "session" / "trajectory.safetensors")
@@ -79,14 +79,14 @@ def test_forces_write_files_and_their_session_replays_them(played, tmp_path: Pat
 
 
 def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) -> None:
-    words = ["--gravity", "weights=1", "direction=-z", "--sequence", "seq_001", "--frames", "4", "--view", "cam_0"]
+    words = ["--gravity", "weights=1", "direction=-z", "--sequences", "seq_001", "--frames", "4", "--cameras", "cam_0"]
     assert simulate.main([str(played.run_dir), *words, "--out", str(tmp_path)]) == 0
     path = tmp_path / "toy" / "forces" / "session.json"
     session = load_session(path)
     assert session.made_with.initial == "seq_001"
     other = replace(session, made_with=replace(session.made_with, model_hash="0", run="elsewhere/seed_3"))
     save_session(other, tmp_path / "other.json")
-    replayed = [str(played.run_dir), "--session", str(tmp_path / "other.json"), "--view", "cam_0"]
+    replayed = [str(played.run_dir), "--session", str(tmp_path / "other.json"), "--cameras", "cam_0"]
     replayed += ["--out", str(tmp_path)]
     assert simulate.main(replayed) == 0
     assert "another method or training (run 'elsewhere/seed_3')" in capsys.readouterr().err
@@ -110,9 +110,9 @@ def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) ->
         (["--force", "weights=1", "direction=x", "at=99"], "at=99: expected 0 to 19"),
         (["--pin"], "expected at least one argument"),
         (["--wind", "weights=1", "direction=x", "--metre", "0"], "--metre 0.0: expected more than 0"),
-        (["--wind", "weights=1", "direction=x", "--sequence", "seq_000", "seq_001"], "name one --object"),
-        (["--wind", "weights=1", "direction=x", "--sequence", "seq_009"], "has no sequence 'seq_009'"),
-        (["--wind", "weights=1", "direction=x", "--view", "cam_9"], "cam_9"),
+        (["--wind", "weights=1", "direction=x", "--sequences", "seq_000", "seq_001"], "name one of --objects"),
+        (["--wind", "weights=1", "direction=x", "--sequences", "seq_009"], "has no sequence 'seq_009'"),
+        (["--wind", "weights=1", "direction=x", "--cameras", "cam_9"], "cam_9"),
         (["--wind", "weights=1", "direction=x", "--session", "s.json"], "no such file|has its own forces"),
         (["--session", "none.json"], "none.json: no such file"),
     ],

@@ -224,7 +224,7 @@ def test_true_motion_that_is_missing_or_of_another_shape(spoilt: Path) -> None:
 
 def test_scene_without_a_pinned_kernel_says_how_to_pin_one(spoilt: Path) -> None:
     (spoilt / "scene.masks.npz").unlink()
-    with pytest.raises(SceneError, match=r"no kernel is pinned.*gausim inspect SCENE --pin-below") as caught:
+    with pytest.raises(SceneError, match=r"no kernel is pinned.*gausim inspect SCENE --pin") as caught:
         ObjectData(spoilt).scene()
     override = re.findall(r"'(data\.selections=.*)'", str(caught.value))
     config = compose("train", [*override, f"data.root={spoilt}"])  # the override that is proposed, as it is

@@ -110,7 +110,7 @@ def test_every_place_near_the_end_of_a_stage(run: Run, jobs: dict, tmp_path: Pat
         folder = tmp_path / f"force_{back}"
         assert run(stage="pack", argv=[*argv, "--margin", "0", "--out", str(folder / "result")])["status"] == 0
         before = contents(folder / "result")
-        command = [*argv, "--force", "--out", str(folder / "result")]
+        command = [*argv, "--overwrite", "--out", str(folder / "result")]
         # A replacement passes one place more than a first result: the old one steps aside.
         killed = run(stage="pack", argv=command, die=places + 1 - back)
         assert killed["status"] == -signal.SIGKILL

@@ -42,7 +42,7 @@ def test_another_result_is_replaced_only_by_force(stage: Stage, tmp_path: Path, 
         stage.inputs["film"].write_bytes(b"other!")
     other = Stage("ingest", 2 if change == "revision" else 1, stage.inputs,
                   {"rate": 25} if change == "setting" else stage.settings)  # fmt: skip
-    with pytest.raises(DataError, match="--force"):
+    with pytest.raises(DataError, match="--overwrite"):
         run_stage(other, tmp_path / "out", make)
     assert read_manifest(tmp_path / "out")["results"] == {"frames": 6}
     assert run_stage(other, tmp_path / "out", lambda work: {"frames": 7}, force=True)["results"] == {"frames": 7}

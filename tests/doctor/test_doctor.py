@@ -120,7 +120,7 @@ SAID = {
     "16-bit PNG": ("files", "fault", "got 64x64 RGBA (16 bit)", "gausim verify"),
     "no alpha": ("files", "fault", "Re-export the frame with alpha", "gausim verify"),
     "a film for frames": ("files", "fault", "it is a film", "gausim verify"),
-    "no pin": ("pins", "fault", "no kernel is pinned", "--pin-below"),
+    "no pin": ("pins", "fault", "no kernel is pinned", "--pin"),
     "not at rest": ("motion", "warning", "Frame 0 is not at rest in seq_003", "last frame before"),
     "one view": ("views", "fault", "one training view only (cam_0)", "two cameras"),
     "a dark camera": ("appearance", "warning", "cam_1 -", "exposure"),
@@ -281,8 +281,8 @@ def test_a_free_body_needs_no_pin_and_may_begin_elsewhere(spoilt: Path, capsys: 
 @pytest.mark.slow
 def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     MISTAKES["no pin"](spoilt)
-    assert told(spoilt, capsys, "--pin-below", "z=0.1")[0] == 0
-    status, entry = told(spoilt, capsys, "--pin-below", "z=9")
+    assert told(spoilt, capsys, "--pin", "below z=0.1")[0] == 0
+    status, entry = told(spoilt, capsys, "--pin", "below z=9")
     assert status == 1 and "pins" in found(entry)
 
 
@@ -309,7 +309,7 @@ ON_THE_BUNNY = {**{k: v for k, v in SAID.items() if k != "no pin"},
 def bunny(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four sequences of the bunny with a rest scene of its own."""
     source, folder = data_root / "bunny", tmp_path_factory.mktemp("bunny")
-    options = ["--pin-below", "z=0.33", "--iterations", "1500"]
+    options = ["--pin", "below z=0.33", "--iterations", "1500"]
     assert main(["reconstruct", str(source), "--out", str(folder / "rest.ply"), *options]) == 0
     return mistakes.copy_object(source, folder / "good", scene=folder / "rest.ply", sequences=4)
 

@@ -31,7 +31,7 @@ def test_half_spaces(scene: GaussianScene) -> None:
     assert selected(HalfSpace(2, above=0.3)(scene)) == [2, 3]
     assert selected(HalfSpace(2, below=0.5, above=0.1)(scene)) == [1, 2]
     assert selected(parse_half_space("y=1.5")(scene)) == [0, 1]
-    assert selected(parse_half_space(" y = 1.5 ", above=True)(scene)) == [2, 3]
+    assert selected(parse_half_space(" above  y = 1.5 ")(scene)) == [2, 3]
 
 
 def test_near_points(scene: GaussianScene) -> None:
@@ -60,7 +60,7 @@ def test_empty_selection_is_refused_with_the_extent(scene: GaussianScene) -> Non
         apply_masks(scene, pinned=parse_half_space("z=-1"))
 
 
-@pytest.mark.parametrize("text", ["0.33", "w=1", "z=", "z<1", "z=1.2.3"])
+@pytest.mark.parametrize("text", ["0.33", "w=1", "left z=1", "z=", "z<1", "z=1.2.3"])
 def test_half_space_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(SceneError, match="AXIS=VALUE"):
         parse_half_space(text)
@@ -75,6 +75,6 @@ def test_what_nothing_holds_and_what_nothing_frees_is_refused(scene: GaussianSce
         require_pinned(dataclasses.replace(scene, simulated=scene.pinned))
     with pytest.raises(SceneError, match="no kernel is pinned") as caught:
         require_pinned(scene)
-    proposed = re.findall(r"z=[-.0-9e]+", str(caught.value))
+    proposed = re.findall(r"below z=[-.0-9e]+", str(caught.value))
     assert len(proposed) == 2  # one for either remedy
     assert {tuple(selected(parse_half_space(text)(scene))) for text in proposed} == {(0,)}

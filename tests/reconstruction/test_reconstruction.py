@@ -260,7 +260,7 @@ def written(images: ImageSet, folder: Path, write: Callable[[Path, Tensor], obje
 def test_command_writes_scene_masks_figures_and_picture(stills: ImageSet, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out" / "s.ply"
     command = [*written(stills, tmp_path, write_rgba), "--out", str(out), "--kernels", "80"]
-    assert main([*command, "--iterations", "40", "--pin-below", "z=-0.2"]) == 0
+    assert main([*command, "--iterations", "40", "--pin", "below z=-0.2"]) == 0
     scene = load_scene(out)
     assert torch.equal(scene.pinned, scene.means[:, 2] < -0.2) and scene.pinned.any()
     record = json.loads(out.with_suffix(".json").read_text())
@@ -268,7 +268,7 @@ def test_command_writes_scene_masks_figures_and_picture(stills: ImageSet, tmp_pa
     assert record["kernels"] == scene.count and record["options"]["iterations"] == 40
     assert out.with_suffix(".png").stat().st_size > 1000
     assert "stills left out" in capsys.readouterr().out
-    assert main([*command, "--iterations", "20", "--pin-below", "z=-9"]) == 2
+    assert main([*command, "--iterations", "20", "--pin", "below z=-9"]) == 2
     assert "holds none of" in capsys.readouterr().err
 
 
@@ -278,7 +278,7 @@ def test_command_pins_below_the_height_that_the_data_set_states(stills: ImageSet
     facts = {"fps": 24, "views": ["a"], "train_views": ["a"], "heldout_views": [], "train_frames": [0, 16]}
     (tmp_path / "dataset.json").write_text(json.dumps({**facts, "pinned_below_z": -0.2}))
     command = ["reconstruct", str(tmp_path), "--kernels", "80", "--iterations", "20", "--video-share", "0"]
-    for given, height in (([], -0.2), (["--pin-below", "z=0.1"], 0.1)):
+    for given, height in (([], -0.2), (["--pin", "below z=0.1"], 0.1)):
         assert main([*command, *given]) == 0
         scene = load_scene(tmp_path / "scene.ply")
         assert torch.equal(scene.pinned, scene.means[:, 2] < height) and scene.pinned.any()
@@ -314,6 +314,6 @@ def test_command_needs_one_source(capsys: pytest.CaptureFixture[str]) -> None:
 def test_real_stills_are_met(data_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene.ply"
     command = ["reconstruct", str(data_root / "bunny"), "--out", str(out), "--iterations", "1500"]
-    assert main([*command, "--pin-below", "z=0.33"]) == 0
+    assert main([*command, "--pin", "below z=0.33"]) == 0
     figures = json.loads(out.with_suffix(".json").read_text())["measured"]["stills left out"]
     assert figures["psnr"] > 30 and figures["psnr_foreground"] > 26

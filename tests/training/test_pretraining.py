@@ -132,7 +132,7 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(
 
     scene, out = tmp_path / "beam.ply", tmp_path / "out"
     save_scene(body, scene)
-    common = ["--scene", str(scene), "--from", str(base), "--pin-below", "z=0.01", "--out", str(out), "--frames", "5"]
+    common = ["--scene", str(scene), "--from", str(base), "--pin", "below z=0.01", "--out", str(out), "--frames", "5"]
     assert simulate.main([*common, "--impulse", "on=tip", "weight_seconds=0.1", "direction=y", "--verbose"]) == 0
     names = {"trajectory.safetensors", "session.json", "azimuth_0.mp4", "azimuth_0_sheet.png"}
     assert {p.name for p in out.iterdir()} == names

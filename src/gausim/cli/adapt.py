@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from gausim.cli.arguments import command_parser
+from gausim.cli.arguments import add_names, command_parser
 from gausim.compose.data_paths import located
 from gausim.core.errors import ConfigError, DataError
 
@@ -53,15 +53,16 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("adapt", epilog=EPILOG)
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
-    add("--data", metavar="STORE", nargs="+", help="directories of the same objects (default: those of the run)")
-    add("--sequences", nargs="+", metavar="NAME", help="only these sequences (default: all)")
-    add("--frames", type=int, default=16, help="frames of each sequence to fit (default: 16)")
-    add("--epochs", type=int, default=EPOCHS, help=f"rounds over the sequences, {REPEATS} steps each (default: "
+    add("--data", metavar="STORE", nargs="+", help="take the objects from these directories (default: the run's)")
+    add_names(parser, "sequences", "fit these sequences (default: all)")
+    add("--frames", type=int, default=16, help="fit so many frames of each sequence (default: 16)")
+    add("--epochs", type=int, default=EPOCHS, help=f"go so often over the sequences, {REPEATS} steps each (default: "
         f"{EPOCHS})")  # fmt: skip
-    add("--out", metavar="DIR", type=Path, help="run directory to write (default: NAME_adapted_FRAMES beside RUN's)")
-    add("--set", metavar="KEY=VALUE", nargs="+", default=[], help="settings other than the run's, e.g. "
-        "trainer.threads=1")  # fmt: skip
-    add("--supervision", choices=tuple(SUPERVISIONS), help="reference of the predictions (default: as in the run)")
+    add("--out", metavar="DIR", type=Path, help="write this run directory (default: NAME_adapted_FRAMES beside RUN's)")
+    add("--overwrite", action="store_true", help="replace the run that is there")
+    add("--set", metavar="KEY=VALUE", nargs="+", default=[], help="change settings of the run, e.g. "
+        "trainer.threads=1 (default: none)")  # fmt: skip
+    add("--supervision", choices=tuple(SUPERVISIONS), help="compare predictions with these (default: as in the run)")
     return parser
 
 
@@ -97,7 +98,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "freeze": "model",
         "evaluate": True,
         "plan": plan,
-        "overwrite": False,
+        "overwrite": arguments.overwrite,
     }
     if arguments.supervision is not None:
         adapted["supervision"] = {"_target_": SUPERVISIONS[arguments.supervision], "_partial_": True}

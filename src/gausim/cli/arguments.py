@@ -1,8 +1,10 @@
-"""Common arguments of several commands."""
+"""Options that several commands share, each with one spelling and one meaning."""
 
 from __future__ import annotations
 
 import argparse
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,46 +28,78 @@ def command_parser(name: str, more: str = "", epilog: str = "") -> argparse.Argu
     return argparse.ArgumentParser(prog=f"gausim {name}", description=COMMANDS[name] + more, epilog=epilog, **raw)
 
 
+def add_names(parser: argparse._ActionsContainer, what: str, text: str, *, several: bool = True) -> None:
+    """Adds ``--objects``, ``--sequences`` or ``--cameras``, which take names, or with ``several=False`` one name."""
+    parser.add_argument(f"--{what}", nargs="+" if several else None, metavar="NAME", help=text)
+
+
 def add_data_option(parser: argparse.ArgumentParser) -> None:
     """Adds ``--data``, which :func:`gausim.compose.data_paths.data_option` reads."""
     parser.add_argument(
         "--data", action="append", default=[], metavar="DIR|scene=FILE",
-        help="where the run's data set lies now, and scene=FILE or masks=FILE where its configuration names such; of "
-        "several sets give each, in the configuration's order (default: where it was trained)",
+        help="read the run's data set from here, and a scene or masks from scene=FILE and masks=FILE; of several sets "
+        "give each, in the configuration's order (default: where it was trained)",
     )  # fmt: skip
 
 
-def add_pin_options(parser: argparse.ArgumentParser) -> None:
-    """Adds --pin-below and --pin-above, which mark roots by height."""
-    add = parser.add_argument
-    add("--pin-below", metavar="AXIS=VALUE", help="pin kernels whose coordinate is below, e.g. z=0.33")
-    add("--pin-above", metavar="AXIS=VALUE", help="pin kernels whose coordinate is above (scenes with up = -y)")
+def add_threads_option(parser: argparse._ActionsContainer) -> None:
+    """Adds ``--threads``."""
+    parser.add_argument("--threads", type=positive, default=1, metavar="N", help="use N processor threads (default: 1)")
 
 
-def pinned_by(scene: GaussianScene, arguments: argparse.Namespace, *, below_z: float | None = None) -> GaussianScene:
-    """The scene with its pins replaced by the union of --pin-below and --pin-above, else by those below a height."""
-    from gausim.ops.selection import apply_masks, parse_half_space
+def add_device_options(parser: argparse._ActionsContainer) -> None:
+    """Adds ``--device``, which :func:`gausim.compose.build.load_run` takes, and ``--threads``."""
+    parser.add_argument(
+        "--device", default="auto", metavar="auto|cpu|cuda[:N]",
+        help="compute there (default: auto, the GPU where there is one)",
+    )  # fmt: skip
+    add_threads_option(parser)
 
-    below, above = arguments.pin_below, arguments.pin_above
-    if below_z is not None and not (below or above):
-        below = f"z={below_z}"
-    sides = ((below, False), (above, True))
-    chosen = [parse_half_space(text, above=above) for text, above in sides if text]
-    return apply_masks(scene, pinned=chosen[0] | chosen[-1]) if chosen else scene
+
+def computing(arguments: argparse.Namespace) -> None:
+    """Takes the threads of :func:`add_device_options` and refuses a device that is not there, before anything is read.
+
+    Raises:
+        ConfigError: there is no such device.
+    """
+    from torch import set_num_threads
+
+    from gausim.compose.device import find_device
+
+    set_num_threads(arguments.threads)
+    find_device(arguments.device)
+
+
+def add_pin_option(parser: argparse._ActionsContainer) -> None:
+    """Adds ``--pin``, which :func:`pinned_by` reads."""
+    parser.add_argument(
+        "--pin", action="append", default=[], metavar="SIDE",
+        help="pin the kernels of the scene on this side, e.g. \"below z=0.33\" or \"above y=1\" [scene units]; more "
+        "than once: on any of the sides (default: the pins that are stored with the scene)",
+    )  # fmt: skip
+
+
+def pinned_by(scene: GaussianScene, sides: list[str], *, below_z: float | None = None) -> GaussianScene:
+    """The scene with its pins replaced by the union of the sides of ``--pin``, else by those below a height."""
+    from gausim.ops.selection import Selection, apply_masks, parse_half_space
+
+    if not sides:
+        sides = [] if below_z is None else [f"below z={below_z}"]
+    chosen: list[Selection] = [parse_half_space(side) for side in sides]
+    return apply_masks(scene, pinned=reduce(or_, chosen)) if chosen else scene
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Adds the options of a scene without videos, which :func:`opened_scene` reads; returns their group."""
     group = parser.add_argument_group("a scene without a run")
     add = group.add_argument
-    add("--from", dest="base", metavar="RUN", type=Path, help="run of model=gausim whose network moves the scene")
+    add("--from", dest="base", metavar="RUN", type=Path, help="move the scene by the network of this run")
     add("--stiffness", type=float, metavar="S",
-        help="the slowest swing takes S^(-1/2) seconds (default with --from: 1)")  # fmt: skip
+        help="let the slowest swing take S^(-1/2) seconds (default with --from: 1)")  # fmt: skip
     add("--damping", type=float, metavar="D",
-        help="amplitudes fall as exp(-D t / 2) [1 / s] (default with --from: 0.5)")  # fmt: skip
-    add("--fps", type=float, default=30.0, help="frames per second (default: 30)")
-    add("--seed", type=int, default=0, help="of the random weights of an untrained model (default: 0)")
-    add_pin_options(parser)
+        help="let amplitudes fall as exp(-D t / 2) [1 / s] (default with --from: 0.5)")  # fmt: skip
+    add("--fps", type=float, default=30.0, help="simulate so many frames per second (default: 30)")
+    add("--seed", type=int, default=0, help="draw the weights of an untrained model with this seed (default: 0)")
     return group
 
 
@@ -80,7 +114,10 @@ def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options:
     given = {"stiffness": arguments.stiffness, "damping": arguments.damping}
     material = {name: value for name, value in given.items() if value is not None}
     even = EvenMaterial(**material) if material else None
-    return open_scene(scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=even, **options)
+    return open_scene(
+        scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=even, device=arguments.device,
+        **options,
+    )  # fmt: skip
 
 
 def positive(text: str) -> int:
@@ -99,10 +136,11 @@ def parse_background(text: str) -> Tensor | None:
     """
     import torch
 
-    if text == "black":
-        return None
+    named = {"black": None, "white": torch.ones(3)}
+    if text in named:
+        return named[text]
     try:
-        color = [1.0, 1.0, 1.0] if text == "white" else [float(v) for v in text.split(",")]
+        color = [float(v) for v in text.split(",")]
     except ValueError:
         color = []
     if len(color) != 3 or not all(0 <= v <= 1 for v in color):

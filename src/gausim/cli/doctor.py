@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import add_pin_option, add_threads_option, command_parser, pinned_by
 from gausim.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -41,12 +41,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("root", metavar="ROOT", type=Path, help="object directory, or a folder of them")
-    add("--scene", metavar="SCENE.ply", type=Path, help="rest scene of a single object; default ROOT/scene.ply")
-    add("--masks", metavar="FILE", type=Path, help="its masks (npz); default beside the scene")
-    add_pin_options(parser)
-    add("--out", metavar="DIR", type=Path, help="folder for pictures and a page that shows them (index.html)")
+    add("--scene", metavar="SCENE.ply", type=Path, help="take this rest scene (default: ROOT/scene.ply)")
+    add("--masks", metavar="FILE", type=Path, help="take its masks (npz) from there (default: beside the scene)")
+    add_pin_option(parser)
+    add("--out", metavar="DIR", type=Path, help="write pictures and a page (index.html) to this folder (default: none)")
     add("--json", action="store_true", help="print an object: {DIRECTORY: {ruinous, faults, findings, left_out}}")
-    add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
+    add_threads_option(parser)
     return parser
 
 
@@ -86,4 +86,4 @@ def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | N
         if arguments.scene is not None:
             raise DataError(f"{data.scene_path}: no such file. Give --scene the PLY that `gausim reconstruct` wrote.")
         return None
-    return pinned_by(load_scene(data.scene_path, masks=data.masks_path, name=data.name), arguments)
+    return pinned_by(load_scene(data.scene_path, masks=data.masks_path, name=data.name), arguments.pin)

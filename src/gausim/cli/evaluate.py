@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausim.cli.arguments import add_data_option, command_parser, positive
+from gausim.cli.arguments import add_data_option, add_device_options, add_names, command_parser, computing, positive
 from gausim.core.errors import ConfigError
 
 
@@ -16,6 +16,7 @@ def main(argv: list[str]) -> int:
         raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
     from gausim.cli.evaluate_run import evaluate
 
+    computing(arguments)
     return evaluate(arguments)
 
 
@@ -23,21 +24,22 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("evaluate", " Writes metrics.json, metrics.npz, table.md and an error plot per object.")
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
-    add("--object", nargs="+", metavar="NAME", help="only these objects")
-    add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
+    add_names(parser, "objects", "measure these objects (default: all)")
+    add_names(parser, "sequences", "measure these sequences of every object (default: all)")
+    add("--cameras", default="all", choices=("all", "train", "heldout"), help="measure in these (default: all)")
     add("--test", action="store_true", help="look at the test part of the data; counted in evaluation/test.json")
-    add("--trials", type=positive, metavar="N", help="with --test: trials made of the method on the development part "
-        "(default: protocol.trials of the run)")  # fmt: skip
-    add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
+    add("--trials", type=positive, metavar="N", help="with --test: declare N trials of the method on the development "
+        "part (default: protocol.trials of the run)")  # fmt: skip
     add("--flip", action="store_true", help="also measure FLIP (extra `flip`), in as much time as all other metrics")
     add_data_option(parser)
-    add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/evaluation, or RUN/evaluation/partial "
-        "for a part")  # fmt: skip
+    add("--out", metavar="DIR", type=Path, help="write to this folder (default: RUN/evaluation, of a part "
+        "RUN/evaluation/partial)")  # fmt: skip
     add(
         "--endurance", type=int, metavar="N",
-        help="also roll N frames far, free and under random pushes in the first 240 (at least 300; 1000 is a good "
-        "number); writes endurance.json and a figure per object",
+        help="also roll N frames far, free and under random pushes in the first 240, and write endurance.json and a "
+        "figure per object (at least 300, e.g. 1000; default: none)",
     )  # fmt: skip
+    add_device_options(parser)
     add("--verbose", action="store_true", help="print all tables, and list the files that are written")
     add("--json", action="store_true", help="print metrics.json and nothing else")
     return parser

@@ -36,17 +36,24 @@ def evaluate(arguments: argparse.Namespace) -> int:
         return _evaluate_bodies(arguments)
     if arguments.flip:
         FLIP()  # where it is not installed it is refused before a look is counted
-    run = load_run(arguments.run, data=data_option(arguments.data))
-    facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
+    run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
+    facts = {
+        "name": run.config.get("name"),
+        "seed": run.config.get("seed"),
+        "views": arguments.cameras,
+        **state_of(run),
+    }
     part, sequences = _choose(run, arguments)
     if arguments.test:
         facts |= _look(run, arguments, sequences, facts)
-        run = load_run(arguments.run, data=data_option(arguments.data))  # now the test part is open
+        run = load_run(
+            arguments.run, data=data_option(arguments.data), device=arguments.device
+        )  # now the test part is open
     elif part:
         facts |= {"part": part}
     results = _evaluate(run, arguments, sequences)
     whole = _home(run.run_dir, part)
-    partial = arguments.object or arguments.sequences or arguments.views != "all"  # never overwrites the whole
+    partial = arguments.objects or arguments.sequences or arguments.cameras != "all"  # never overwrites the whole
     folder = arguments.out or (whole / "partial" if partial else whole)
     summary = write_evaluation(folder, results, facts)
     drawn: list[str] = []
@@ -72,14 +79,14 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 def _evaluate_bodies(arguments: argparse.Namespace) -> int:
     """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
-    parts = arguments.object or arguments.sequences or arguments.views != "all" or arguments.test
+    parts = arguments.objects or arguments.sequences or arguments.cameras != "all" or arguments.test
     if parts or arguments.flip or arguments.endurance is not None:
         raise ConfigError(
-            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, "
-            "--sequences, --views, --test, --flip and --endurance."
+            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --objects, "
+            "--sequences, --cameras, --test, --flip and --endurance."
         )
     folder = arguments.out or arguments.run / "evaluation"
-    module, data = load_corpus_run(arguments.run, data=data_option(arguments.data))
+    module, data = load_corpus_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     pretrained = _pretrained(arguments.run, data.trainable)
     whole = write_figures(folder, body_figures(module, data), seen=data.seen, pretrained=pretrained)
     if arguments.json:
@@ -111,7 +118,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str
                 {run.module.method_name: TrainedPrediction(run, item)},
                 run.renderer,
                 sequences=sequences[item.data.name],
-                views=_views(item.data, arguments.views),
+                views=_views(item.data, arguments.cameras),
                 flip=arguments.flip,
                 advance=advance,
             )
@@ -121,7 +128,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
     """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
-    found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
+    found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.objects)}
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
     for name, rollouts in found.items():
         endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
@@ -134,13 +141,13 @@ def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list
 def _views(data: ObjectData, group: str) -> list[str]:
     chosen = {"train": data.train_views, "heldout": data.heldout_views}.get(group, data.views)
     if not chosen:
-        raise DataError(f"{data.root}: dataset.json names no held-out view. Use --views all or train.")
+        raise DataError(f"{data.root}: dataset.json names no held-out view. Use --cameras all or train.")
     return list(chosen)
 
 
 def _choose(run: LoadedRun, arguments: argparse.Namespace) -> tuple[str | None, dict[str, list[str]]]:
     """The part to evaluate (None where the data declare no test part), and names of its sequences by object."""
-    items = run_objects(run, arguments.object)
+    items = run_objects(run, arguments.objects)
     declared = any({r.name for r in item.data.sequences} & item.data.test_part for item in items)
     if not declared and (arguments.test or arguments.trials):
         raise ConfigError(

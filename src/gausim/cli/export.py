@@ -9,11 +9,20 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from gausim.cli.arguments import add_data_option, command_parser, parse_background, positive
+from gausim.cli.arguments import (
+    add_data_option,
+    add_device_options,
+    add_names,
+    command_parser,
+    computing,
+    parse_background,
+    positive,
+)
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import numpy as np
+    import torch
 
     from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 
@@ -30,11 +39,13 @@ class Motion:
     trajectory: Trajectory | None = None  # the motion as a trajectory, if it was read as one
     cameras: Cameras | None = None  # cameras of the data set, if any
     renderer: Renderer | None = None  # renderer of the run, if any
+    device: torch.device | str = "cpu"  # where pictures are drawn
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
+    computing(arguments)
     motion = _thinned(_opened(arguments), arguments.every)
     path = arguments.out or Path(f"{motion.name}{FORMATS[arguments.format].suffix}")
     count = _write(motion, path, arguments)
@@ -52,23 +63,25 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); or a folder of "
         "name_0001.ply, ...")  # fmt: skip
-    add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
-    add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply and gltf); default NAME.SUFFIX here")
-    add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
-    add("--object", metavar="NAME", help="of a run; default its first")
-    add("--sequence", metavar="NAME", help="of a run; default its first")
+    add("--format", required=True, choices=list(FORMATS), help="write this format, see below")
+    add("--out", metavar="PATH", type=Path, help="write this file, of ply and gltf this folder (default: NAME.SUFFIX)")
+    add("--scene", type=Path, metavar="SCENE.ply", help="take this rest scene of a trajectory")
+    add_names(parser, "objects", "export this object of a run (default: its first)", several=False)
+    add_names(parser, "sequences", "export this sequence of a run (default: its first)", several=False)
     add_data_option(parser)
-    add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
-    add("--every", type=positive, default=1, metavar="N", help="take every so many frames")
-    add("--fps", type=float, help="of a folder of PLY files that does not say it")
-    add("--up", default="z", choices=("y", "z"), help="vertical axis (default: z)")
+    add("--frames", type=positive, metavar="N", help="predict N frames (default: as many as were recorded)")
+    add("--every", type=positive, default=1, metavar="N", help="take every N-th frame (default: 1)")
+    add("--fps", type=float, help="play a folder of PLY files so fast [frames / s] (default: as it says)")
+    add("--up", default="z", choices=("y", "z"), help="point the vertical axis so (default: z)")
+    add_device_options(parser)
     pictures = parser.add_argument_group("mp4, gif and html")
-    pictures.add_argument("--view", metavar="NAME", help="camera of the run's data set")
-    pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="of a camera about the "
-                          "vertical, where no --view is named (default: 30)")  # fmt: skip
-    pictures.add_argument("--size", type=positive, default=480, metavar="PIXELS", help="height and width of mp4 and "
-                          "gif (480)")  # fmt: skip
-    pictures.add_argument("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1")
+    add_names(pictures, "cameras", "look from this camera of the run's data set (default: --azimuth)", several=False)
+    pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="look from this side "
+                          "(default: 30)")  # fmt: skip
+    pictures.add_argument("--size", type=positive, default=480, metavar="PIXELS", help="draw mp4 and gif in this "
+                          "height and width (default: 480)")  # fmt: skip
+    pictures.add_argument("--background", default="black", metavar="COLOR", help="draw on black, white or R,G,B in "
+                          "0..1 (default: black)")  # fmt: skip
     return parser
 
 
@@ -101,13 +114,13 @@ def _from_run(arguments: argparse.Namespace) -> Motion:
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import TrainedPrediction, run_objects, scene_of, sequence_of, state_of
 
-    run = load_run(arguments.source, data=data_option(arguments.data))
+    run = load_run(arguments.source, data=data_option(arguments.data), device=arguments.device)
     state_of(run)
-    item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
-    record = sequence_of(item, arguments.sequence or item.data.sequences[0].name)
-    trajectory = TrainedPrediction(run, item)(record, arguments.frames)
+    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
+    record = sequence_of(item, arguments.sequences or item.data.sequences[0].name)
+    trajectory = TrainedPrediction(run, item)(record, arguments.frames).to("cpu")
     motion = _of_trajectory(f"{item.data.name}_{record.name}", scene_of(run, item), trajectory)
-    return replace(motion, cameras=record.cameras, renderer=run.renderer)
+    return replace(motion, cameras=record.cameras, renderer=run.renderer, device=run.device)
 
 
 def _of_trajectory(name: str, scene: GaussianScene, trajectory: Trajectory) -> Motion:
@@ -187,23 +200,29 @@ def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndar
     background, camera = parse_background(arguments.background), _camera(motion, arguments)
     renderer = motion.renderer or instantiate(compose("render/cpu").render)
     for scene in motion.scenes():
-        made = draw_still(renderer, scene, camera, background=background, mask=motion.first.foreground)
+        made = draw_still(
+            renderer,
+            scene.to(motion.device),
+            camera,
+            background=background,
+            mask=motion.first.foreground.to(motion.device),
+        )
         yield to_bytes(made.rgb[0, 0]).cpu().numpy()
 
 
 def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
     from gausim.ops.orbit import orbit_cameras
 
-    if arguments.view is None:
+    if arguments.cameras is None:
         size = (arguments.size, arguments.size)
         means = motion.first.means[motion.first.foreground]
         return orbit_cameras(means, azimuths=[arguments.azimuth], up=arguments.up, size=size)
     names = [] if motion.cameras is None else list(motion.cameras.names)
-    if motion.cameras is None or arguments.view not in names:
+    if motion.cameras is None or arguments.cameras not in names:
         raise DataError(
-            f"--view {arguments.view}: expected one of {names} (cameras of a run's data set), or --azimuth."
+            f"--cameras {arguments.cameras}: expected one of {names} (cameras of a run's data set), or --azimuth."
         )
-    return motion.cameras.select([names.index(arguments.view)])
+    return motion.cameras.select([names.index(arguments.cameras)])
 
 
 class Format(NamedTuple):

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import UPS, add_data_option, add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import UPS, add_data_option, add_names, add_pin_option, command_parser, pinned_by
 from gausim.core.errors import SceneError
 
 if TYPE_CHECKING:
@@ -52,26 +52,26 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("inspect")
     add = parser.add_argument
     add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY), or a RUN with --property")
-    add("--masks", metavar="FILE", type=Path, help="masks (npz); default <stem>.masks.npz next to the scene, if there")
-    add_pin_options(parser)
-    add("--simulate-below", metavar="AXIS=VALUE", help="simulate only kernels below (others are drawn, never moved)")
-    add("--simulate-above", metavar="AXIS=VALUE", help="simulate only kernels above")
+    add("--masks", metavar="FILE", type=Path, help="read these masks (npz; default: <stem>.masks.npz, if there)")
+    add_pin_option(parser)
+    add("--simulate", action="append", default=[], metavar="SIDE", help="simulate only kernels on this side, e.g. "
+        "\"above z=0.1\" [scene units]; draw the others without moving them (default: as stored)")  # fmt: skip
     add("--save-masks", action="store_true", help="store the masks so that every command uses them")
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
-        help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated "
-        "kernels' bounding box; default {:g} {:g}, as of model=gausim".format(*DEFAULT_RADII))  # fmt: skip
+        help="bound the clusters' diameters per level, fine to coarse [diagonals of the simulated kernels' bounding "
+        "box] (default: {:g} {:g}, as of model=gausim)".format(*DEFAULT_RADII))  # fmt: skip
     add("--clustering", default=DEFAULT_CLUSTERING, choices=tuple(CLUSTERINGS),
-        help="clustering method; default %(default)s, as of model=gausim")  # fmt: skip
+        help="cluster by this method (default: %(default)s, as of model=gausim)")  # fmt: skip
     add("--up", choices=UPS,
-        help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
+        help="draw this axis upwards (write --up=-y; default: away from the pins, else z)")  # fmt: skip
     add("--out", metavar="PICTURE.png", type=Path,
-        help="default <stem>.clusters.png, of a property OBJECT.PROPERTY.png")  # fmt: skip
+        help="write this picture (default: <stem>.clusters.png, of a property OBJECT.PROPERTY.png)")  # fmt: skip
     learned = parser.add_argument_group("the material that a run has learned")
     learned.add_argument("--property", choices=PROPERTIES, help="colour the Gaussians by it: a picture, and a PLY "
                          "with these colours and the property")  # fmt: skip
-    learned.add_argument("--object", metavar="NAME", help="of the run; default its first")
+    add_names(learned, "objects", "colour this object of the run (default: its first)", several=False)
     learned.add_argument("--azimuths", type=float, nargs="+", default=[30.0, 210.0], metavar="DEGREE",
-                         help="cameras about the vertical (default: 30 210)")  # fmt: skip
+                         help="look from these sides (default: 30 210)")  # fmt: skip
     add_data_option(parser)
     return parser
 
@@ -79,11 +79,9 @@ def _parser() -> argparse.ArgumentParser:
 def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
     from gausim.ops.selection import apply_masks, parse_half_space
 
-    for text, above in ((arguments.simulate_below, False), (arguments.simulate_above, True)):
-        if text:
-            mask = scene.simulated & parse_half_space(text, above=above)(scene)
-            scene = apply_masks(scene, simulated=mask)
-    return pinned_by(scene, arguments)
+    for side in arguments.simulate:
+        scene = apply_masks(scene, simulated=scene.simulated & parse_half_space(side)(scene))
+    return pinned_by(scene, arguments.pin)
 
 
 def _print_scene(scene: GaussianScene) -> None:
@@ -132,6 +130,7 @@ def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namesp
 
 
 def _away_from_pins(arguments: argparse.Namespace) -> str:
-    if arguments.pin_below:
-        return str(arguments.pin_below.strip()[0])
-    return "-" + arguments.pin_above.strip()[0] if arguments.pin_above else "z"
+    from gausim.ops.selection import parse_half_space
+
+    half = parse_half_space(arguments.pin[0] if arguments.pin else "below z=0")
+    return ("" if half.above is None else "-") + "xyz"[half.axis]

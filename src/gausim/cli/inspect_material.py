@@ -28,7 +28,7 @@ def show_material(arguments: argparse.Namespace) -> int:
     """Writes picture and PLY of a property, and prints its range; returns the exit status."""
     run, name = load_run(arguments.scene, data=data_option(arguments.data)), arguments.property
     state_of(run)
-    item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
+    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
     scene, found = scene_of(run, item).to("cpu"), _learned(run, item.scene_id, name, arguments.scene)
     known = torch.isfinite(found.values)
     scale = property_scale(found.values)

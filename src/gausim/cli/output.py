@@ -60,7 +60,7 @@ def program() -> str:
 
 def push(run: Path | str, name: str | None = None) -> list[object]:
     """The command that pushes an object of a run."""
-    return ["simulate", run, *(["--object", name] if name else []), *PUSH.split()]
+    return ["simulate", run, *(["--objects", name] if name else []), *PUSH.split()]
 
 
 def error_sentences(entries: Mapping[str, dict[str, Any]]) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import add_pin_option, add_threads_option, command_parser, pinned_by
 from gausim.cli.output import bars
 from gausim.core.errors import ConfigError, DataError
 
@@ -49,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
     add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
     add_fit_options(parser)
-    add_pin_options(parser)
+    add_pin_option(parser)
     return parser
 
 
@@ -57,7 +57,7 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     """Reconstructs a scene and writes it to ``out``, with figures (JSON) and a picture (PNG) beside it.
 
     ``source`` is ``dataset.json`` of an object or ``transforms.json`` of stills; ``arguments`` are those of
-    :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`. Returns the figures as plain data and
+    :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_option`. Returns the figures as plain data and
     as text.
 
     Raises:
@@ -79,7 +79,7 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     renderer = CpuRenderer() if arguments.renderer == "cpu" else ReferenceRenderer()
     start = time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
-    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments, below_z=below_z)
+    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments.pin, below_z=below_z)
     seconds = time.process_time() - start
     save_scene(scene, out)
     record = {
@@ -122,7 +122,7 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "evaluation (default %(default)s)")  # fmt: skip
     add("--background", default="random", choices=("random", "black"), help="behind training images (random)")
     add("--renderer", default="cpu", choices=("cpu", "reference"), help="default %(default)s")
-    add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
+    add_threads_option(parser)
     add("--seed", type=int, default=0, help="seed of random numbers (default %(default)s)")
 
 

@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gausim.cli.arguments import UPS, add_data_option, add_scene_options, command_parser, parse_background, positive
+from gausim.cli.arguments import (
+    UPS,
+    add_data_option,
+    add_device_options,
+    add_names,
+    add_scene_options,
+    command_parser,
+    computing,
+    parse_background,
+    positive,
+)
 from gausim.core.errors import ConfigError
 
 
@@ -15,13 +25,15 @@ def main(argv: list[str]) -> int:
     parse_background(arguments.background)  # raises on a wrong value before the simulation
     if (arguments.run is None) == (arguments.scene is None):
         raise ConfigError("expected a RUN, or --scene SCENE.ply and the run whose network moves it, --from RUN.")
-    if arguments.scene is not None:
-        from gausim.cli.simulate_run import simulate_scene
+    # Sides pin the scene before it begins, parts during the simulation.
+    sides = [" ".join(words) for words in arguments.pin if "=" not in words[0] or words[0][:2] in ("x=", "y=", "z=")]
+    arguments.pin, arguments.sides = [words for words in arguments.pin if " ".join(words) not in sides], sides
+    if arguments.run is not None and (sides or arguments.base):
+        raise ConfigError("--pin SIDE and --from: expected with --scene only. A run has its pins and its network.")
+    from gausim.cli.simulate_run import simulate_run, simulate_scene
 
-        return simulate_scene(arguments)
-    from gausim.cli.simulate_run import simulate_run
-
-    return simulate_run(arguments)
+    computing(arguments)
+    return simulate_run(arguments) if arguments.scene is None else simulate_scene(arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -36,22 +48,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("run", metavar="RUN", nargs="?", type=Path, help="run directory of `gausim train`")
-    add("--object", nargs="+", metavar="NAME", help="only these objects")
-    add("--sequence", nargs="+", metavar="NAME", help="sequences, or `all`; default the first of each object")
-    add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
-    add("--view", nargs="+", metavar="NAME", help="cameras; default the first trained and the first held-out one")
+    add_names(parser, "objects", "simulate these objects (default: all)")
+    add_names(parser, "sequences", "simulate these sequences, or `all` (default: the first of each object)")
+    add_names(parser, "cameras", "draw these (default: the first trained and the first held-out one)")
+    add("--frames", type=positive, metavar="N", help="predict N frames (default: as many as were recorded)")
     add_data_option(parser)
-    add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/simulation")
-    add("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1 (default: black)")
-    add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")
-    add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion of the videos, e.g. 3")
+    add("--out", metavar="DIR", type=Path, help="write to this folder (default: RUN/simulation)")
+    add("--background", default="black", metavar="COLOR", help="draw on black, white or R,G,B in 0..1 (default: black)")
+    add("--brighten", type=float, default=1.0, metavar="GAIN", help="multiply the pictures' colours (default: 1)")
+    add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow the videos down, e.g. by 3 (default: 1)")
     add("--gif", action="store_true", help="write GIFs besides")
+    add_device_options(parser)
     add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
     group = add_scene_options(parser)
     group.add_argument(
-        "--scene", metavar="SCENE.ply", type=Path, help="3DGS scene; give --from, and pins if it has none"
+        "--scene", metavar="SCENE.ply", type=Path, help="simulate this 3DGS scene; give --from, and pins if it has none"
     )
-    group.add_argument("--up", choices=UPS, default="z", help="vertical axis of the scene (write --up=-y; default: z)")
-    group.add_argument("--azimuth", type=float, default=0.0, metavar="DEGREES", help="of the camera (default: 0)")
+    group.add_argument("--up", choices=UPS, default="z", help="point the vertical axis so (write --up=-y; default: z)")
+    group.add_argument("--azimuth", type=float, default=0.0, metavar="DEGREE", help="look from there (default: 0)")
     return parser

@@ -44,12 +44,12 @@ SIZE = (480, 480)
 
 def simulate_run(arguments: argparse.Namespace) -> int:
     """Simulates objects of a run, under forces if there are any; returns the exit status."""
-    run = load_run(arguments.run, data=data_option(arguments.data))
+    run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     state_of(run)
     folder = arguments.out or run.run_dir / "simulation"
     if arguments.session or has_forces(arguments):
         return _simulate_forces(run, arguments, folder)
-    items = run_objects(run, arguments.object)
+    items = run_objects(run, arguments.objects)
     sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
     first = items[0].data.name
     push_it = push(arguments.run, first if len(run.objects) > 1 else None)
@@ -59,9 +59,9 @@ def simulate_run(arguments: argparse.Namespace) -> int:
 
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
     """Writes all results on an object's sequences; returns a sentence on their errors."""
-    names = arguments.sequence or [item.data.sequences[0].name]
+    names = arguments.sequences or [item.data.sequences[0].name]
     names = [record.name for record in item.data.sequences] if names == ["all"] else names
-    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    views = arguments.cameras or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     for name in names:
         sequence_of(item, name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
     predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
@@ -124,15 +124,15 @@ def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -
     """Simulates one object under forces; writes trajectory, session, videos and pictures; returns the exit status."""
     if arguments.session and has_forces(arguments):
         raise ConfigError("--session has its own forces: leave --force and the like out, or edit the session's file.")
-    if len(arguments.object or []) > 1 or len(arguments.sequence or []) > 1:
-        raise ConfigError("forces act on one object from one initial state: name one --object and one --sequence.")
+    if len(arguments.objects or []) > 1 or len(arguments.sequences or []) > 1:
+        raise ConfigError("forces act on one object from one state: name one of --objects and one of --sequences.")
     if not arguments.metre > 0:
         raise ConfigError(f"--metre {arguments.metre}: expected more than 0 scene units.")
     found = load_session(arguments.session) if arguments.session else None
     item, interaction = _opened(run, arguments, found)
     frames = arguments.frames or item.data.sequences[0].count
     session = _known(interaction, found, arguments) if found else _new_session(interaction, arguments, frames)
-    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    views = arguments.cameras or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     item.data.sequences[0].camera_indices(views)  # raises on an unknown view before the simulation
     arrows: list[list[Arrow]] = []
     trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
@@ -162,7 +162,7 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
         raise ConfigError("--scene: its motion needs a trained network, --from RUN (a run of model=gausim).")
     if arguments.session:
         raise ConfigError("--session replays what was done to a run's object. With --scene give --force and the like.")
-    scene = pinned_by(load_scene(arguments.scene), arguments)
+    scene = pinned_by(load_scene(arguments.scene), arguments.sides)
     interaction = opened_scene(
         scene, arguments, sway=0.0 if has_forces(arguments) else SWAY, gravity=STANDARD_GRAVITY * arguments.metre,
         most_force=arguments.most_force,
@@ -192,11 +192,11 @@ def _list(folder: Path, arguments: argparse.Namespace) -> None:
 
 def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
     """The named object and its interaction; by default the object of the session, or the first."""
-    names = arguments.object
+    names = arguments.objects
     if names is None and found and found.made_with.scene in [item.data.name for item in run_objects(run)]:
         names = [found.made_with.scene]
     item = run_objects(run, names)[0]
-    start = arguments.sequence[0] if arguments.sequence else (found.made_with.initial if found else REST)
+    start = arguments.sequences[0] if arguments.sequences else (found.made_with.initial if found else REST)
     return item, open_interaction(
         run, name=item.data.name, sequence=start, gravity=STANDARD_GRAVITY * arguments.metre,
         most_force=arguments.most_force,

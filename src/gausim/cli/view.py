@@ -9,7 +9,18 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import UPS, add_data_option, add_scene_options, command_parser, opened_scene, pinned_by
+from gausim.cli.arguments import (
+    UPS,
+    add_data_option,
+    add_device_options,
+    add_names,
+    add_pin_option,
+    add_scene_options,
+    command_parser,
+    computing,
+    opened_scene,
+    pinned_by,
+)
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,6 +36,7 @@ def main(argv: list[str]) -> int:
         from gausim.viewer.app import Viewer
     except ModuleNotFoundError as error:
         raise ConfigError(f"the viewer needs {error.name}: pip install 'gausim[view]'.") from error
+    computing(arguments)
     token = os.environ.get("GAUSIM_VIEW_TOKEN")
     access = Access(arguments.host, arguments.port, arguments.allow_remote, tuple(arguments.name), token).checked()
     viewer = Viewer(_subject(arguments), access)
@@ -51,19 +63,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("what", metavar="RUN|SCENE.ply", type=Path, help="run directory of `gausim train`, or a 3DGS scene")
-    add("--object", metavar="NAME", help="of the run; default its first")
-    add("--sequence", metavar="NAME", default="rest", help="whose beginning is the initial state (default: rest)")
-    add("--beside", metavar="RUN", type=Path, help="another run of the same object, to which the same is done")
+    add_names(parser, "objects", "show this object of the run (default: its first)", several=False)
+    add_names(parser, "sequences", "begin where this sequence begins (default: at rest)", several=False)
+    add("--beside", metavar="RUN", type=Path, help="show another run of the same object, and do the same to both")
     add_data_option(parser)
-    add("--gravity", type=float, metavar="G", help="what makes a weight of a mass [scene units / s^2] (default: 9.81)")
-    add("--up", choices=UPS, default="z", help="vertical axis of the scene (default: z)")
-    add("--sessions", metavar="DIR", type=Path, help="where sessions are saved; default RUN/sessions or ./sessions")
-    add("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen at (default: 127.0.0.1)")
-    add("--port", type=int, default=8080, help="0 takes a free one (default: 8080)")
-    add("--allow-remote", action="store_true", help="with --host: other machines may connect, with the printed token")
-    add("--name", action="append", default=[], metavar="HOST", help="host name by which the page may be asked for")
-    add("--seconds", type=int, metavar="N", help="stop after so many seconds; default when interrupted")
-    add_scene_options(parser)
+    add("--gravity", type=float, metavar="G", help="set the weight of a mass [scene units / s^2] (default: 9.81)")
+    add("--up", choices=UPS, default="z", help="point the scene's vertical axis so (write --up=-y; default: z)")
+    add("--sessions", metavar="DIR", type=Path, help="save sessions there (default: RUN/sessions or ./sessions)")
+    add("--host", default="127.0.0.1", metavar="ADDRESS", help="listen at this address (default: 127.0.0.1)")
+    add("--port", type=int, default=8080, help="listen at this port, 0: at a free one (default: 8080)")
+    add("--allow-remote", action="store_true", help="with --host: let other machines in, with the printed token")
+    add("--name", action="append", default=[], metavar="HOST", help="answer to this host name, too")
+    add("--seconds", type=int, metavar="N", help="stop after so many seconds (default: when interrupted)")
+    add_device_options(parser)
+    add_pin_option(add_scene_options(parser))
     return parser
 
 
@@ -75,9 +88,9 @@ def _subject(arguments: argparse.Namespace) -> Subject:
     if arguments.beside is not None and not is_run:
         raise ConfigError("--beside: expected a RUN before it, got a scene. Give two runs of one object.")
     if is_run:
-        made = _of_run(arguments.what, arguments, arguments.object)
+        made = _of_run(arguments.what, arguments, arguments.objects)
     else:
-        bare = pinned_by(load_scene(arguments.what), arguments)
+        bare = pinned_by(load_scene(arguments.what), arguments.pin)
         made = Playable(opened_scene(bare, arguments, gravity=arguments.gravity))
     if arguments.beside is not None:
         beside = _of_run(arguments.beside, arguments, made.interaction.scene.name)
@@ -93,8 +106,9 @@ def _of_run(path: Path, arguments: argparse.Namespace, name: str | None) -> Play
     from gausim.cli.view_subject import playable_run
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
+    from gausim.compose.live import REST
     from gausim.compose.predict import state_of
 
-    run = load_run(path, data=data_option(arguments.data))
+    run = load_run(path, data=data_option(arguments.data), device=arguments.device)
     state_of(run)
-    return playable_run(run, name=name, sequence=arguments.sequence, gravity=arguments.gravity)
+    return playable_run(run, name=name, sequence=arguments.sequences or REST, gravity=arguments.gravity)

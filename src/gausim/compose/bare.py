@@ -11,8 +11,9 @@ import torch
 from omegaconf import OmegaConf
 
 from gausim.compose.config import compose, instantiate
+from gausim.compose.device import find_device
 from gausim.compose.live import energy_ceiling
-from gausim.core import GaussianScene
+from gausim.core import GaussianScene, SimState
 from gausim.core.errors import ConfigError
 from gausim.core.state import initial_sway
 from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
@@ -64,6 +65,7 @@ def open_scene(
     gravity: float | None = None,
     most_force: float | None = None,
     keep: int | None = 0,
+    device: str = "cpu",
 ) -> Interaction:
     """Opens a scene without videos, some of its kernels pinned, for interaction.
 
@@ -71,11 +73,12 @@ def open_scene(
     None: an untrained model of this ``seed``, of the reference material where no ``material`` is given. ``sway`` is the
     initial displacement per frame of the kernel farthest from the pins [diagonals], ``gravity`` the unit of weight
     [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the number of latest frames that
-    are kept (None: all).
+    are kept (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
 
     Raises:
         SceneError: no kernel is pinned.
-        ConfigError: the frame rate is not positive and finite, or ``base`` is a run of another model.
+        ConfigError: there is no such device, the frame rate is not positive and finite, or ``base`` is a run of
+            another model.
     """
     if not (math.isfinite(fps) and fps > 0):
         raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
@@ -89,7 +92,9 @@ def open_scene(
         material = EvenMaterial()
     if material is not None:
         give_even_material(model, 0, period=material.period, damping=material.damping)
-    initial = initial_sway(scene, sway)
+    place, swaying = find_device(device), initial_sway(scene, sway)
+    initial = SimState(swaying.positions.to(place), swaying.previous.to(place))
+    model = model.to(place)
     dynamics = scene_dynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
     run = "untrained" if base is None else base.resolve().name
     made_with = MadeWith.of(scene, model, initial, settings=UNTRAINED, run=run)

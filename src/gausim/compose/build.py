@@ -8,15 +8,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.compose.config import instantiate
 from gausim.compose.data_paths import located
+from gausim.compose.device import find_device
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.data.pretraining import CorpusDataModule
 from gausim.losses.objective import Objective
+from gausim.render.auto import AutoRenderer
+from gausim.render.cpu import CpuRenderer
+from gausim.render.gsplat import GsplatRenderer
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
@@ -37,8 +42,9 @@ class LoadedRun:
     module: GausSimModule  # the module in evaluation mode, with the run's weights (averaged ones if there are any)
     objects: list[ObjectData]  # the objects; their index is the ``scene_id`` of the module's scenes
     datamodule: ReadyDataModule  # the data
-    renderer: Renderer  # the renderer of the training
+    renderer: Renderer  # the renderer of the training, or the one that fits the device
     run_dir: Path  # the run directory
+    device: torch.device = torch.device("cpu")  # where the module is
 
 
 def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:
@@ -145,23 +151,35 @@ def _shared_simulator(config: DictConfig, model: Any, datamodule: ReadyDataModul
     return SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
 
 
-def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
+def load_run(
+    run_dir: Path | str,
+    *,
+    checkpoint: str = "last.ckpt",
+    data: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+) -> LoadedRun:
     """Loads a run; its test part is sealed until `gausim evaluate --test` has looked at it.
 
-    ``data`` replaces keys of the data configuration, e.g. ``{"root": "/elsewhere"}``.
+    ``data`` replaces keys of the data configuration, e.g. ``{"root": "/elsewhere"}``; ``device`` as for
+    :func:`gausim.compose.device.find_device`.
 
     Raises:
+        ConfigError: there is no such device, or the run was pretrained on bodies without videos.
         RunError: the run or checkpoint is missing, or the scene differs from the one it was trained on.
         DataError: the data set or scene of the configuration is not on this machine, and no replacement is given.
     """
-    directory = RunDirectory(run_dir)
+    directory, place = RunDirectory(run_dir), find_device(device)
     if is_pretrained(directory.path):
         raise ConfigError(
             f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
             f"it: `gausim train experiment=finetune model=gausim init_from={directory.path} data.root=OBJECT`."
         )
     config, module, datamodule = _load(directory, checkpoint, data)
-    return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)
+    # A renderer of the other kind of device gives way to the one that fits.
+    renderer: Renderer = module.renderer
+    if isinstance(renderer, CpuRenderer if place.type == "cuda" else GsplatRenderer):
+        renderer = cast(Renderer, AutoRenderer(near=renderer.near))
+    return LoadedRun(config, module.to(place), datamodule.objects, datamodule, renderer, directory.path, place)
 
 
 def is_pretrained(run_dir: Path | str) -> bool:
@@ -171,11 +189,12 @@ def is_pretrained(run_dir: Path | str) -> bool:
 
 
 def load_corpus_run(
-    run_dir: Path | str, *, data: Mapping[str, Any] | None = None
+    run_dir: Path | str, *, data: Mapping[str, Any] | None = None, device: str = "cpu"
 ) -> tuple[GausSimModule, CorpusDataModule]:
     """Loads a run of which :func:`is_pretrained` is true; arguments and errors are those of :func:`load_run`."""
+    place = find_device(device)
     _, module, datamodule = _load(RunDirectory(run_dir), "last.ckpt", data)
-    return module, cast(CorpusDataModule, datamodule)
+    return module.to(place), cast(CorpusDataModule, datamodule)
 
 
 def _load(

@@ -89,7 +89,8 @@ def _method(
     run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
 ) -> tuple[SimState, Steppable, Tensor, float | None, HandPath | None]:
     """Initial state, dynamics, masses, the limit of the energy, and the recorded path of the hands."""
-    module, still = run.module, SimState(scene.means, scene.means)
+    module, rest = run.module, scene.means.to(run.device)
+    still = SimState(rest, rest)
     names = [record.name for record in item.data.sequences]
     if sequence != REST and sequence not in names:
         raise DataError(f"{item.data.root}: has no sequence '{sequence}'; expected '{REST}' or one of {names}.")

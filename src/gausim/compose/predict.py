@@ -137,7 +137,11 @@ def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
         raise ConfigError(
             f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
         )
-    scene, model, states = scene_of(run, item), cast(Any, run.module.model), cast(Any, run.module.initial_states)
+    scene, model, states = (
+        scene_of(run, item).to(run.device),
+        cast(Any, run.module.model),
+        cast(Any, run.module.initial_states),
+    )
     dynamics = SceneDynamics(model, item.scene_id)
     first, hands = states.state(item.first_sequence).detach(), run.module.method.hands(item.first_sequence)
     free = scene.simulated & ~scene.pinned

@@ -45,6 +45,13 @@ class Trajectory:
         """Number of frames F, the initial state included."""
         return self.positions.shape[0]
 
+    def to(self, device: torch.device | str) -> Trajectory:
+        """The same on a device."""
+        return Trajectory(
+            self.positions.to(device), self.deformation_gradients.to(device), self.rotations.to(device),
+            self.unit_of_kernel.to(device), self.fps,
+        )  # fmt: skip
+
     def part(self, frames: slice) -> Trajectory:
         """The chosen frames."""
         states = self.positions[frames], self.deformation_gradients[frames], self.rotations[frames]

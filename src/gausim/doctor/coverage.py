@@ -123,7 +123,7 @@ def find_pins(evidence: Evidence) -> Iterator[Finding]:
         sentence, _, remedy = str(error).partition(". ")
         yield Finding(
             "fault", "certain", f"{sentence.rstrip('.')}.",
-            remedy or "Pin fewer kernels: --pin-below with a lower height.",
+            remedy or "Pin fewer kernels, e.g. --pin \"below z=...\" with a lower height.",
             {"pinned": int(scene.pinned.sum()), "simulated": int(scene.simulated.sum())},
         )  # fmt: skip
         return

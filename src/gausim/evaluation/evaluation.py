@@ -218,9 +218,11 @@ class _ObjectMeasure:
             trajectories[name] = self._checked(name, record, made)
         truth = self.data.ground_truth(record)
         reference = self.reference.trajectory(record, truth)
-        rows = self._images(record, trajectories, reference, pictures)
+        device = next((made.positions.device for made in trajectories.values()), reference.positions.device)
+        rows = self._images(record, trajectories, reference.to(device), pictures)
         if truth is not None:
-            self._points(rows, {**trajectories, self.reference.name: reference}, truth)
+            moved = {name: trajectory.to("cpu") for name, trajectory in trajectories.items()}
+            self._points(rows, {**moved, self.reference.name: reference}, truth)
         return rows
 
     def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
@@ -242,7 +244,7 @@ class _ObjectMeasure:
         reference: Trajectory,
         pictures: PictureRecorder | None,
     ) -> Rows:
-        cameras = record.cameras_of(self.views).to(self.scene.means.device)
+        cameras = record.cameras_of(self.views)
         first = self._draw(reference, range(1), cameras)
         parts: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
         before: dict[str, Tensor] = {}
@@ -296,7 +298,7 @@ class _ObjectMeasure:
             predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
         moving = {name: points for name, points in predicted.items() if name != self.reference.name}
         levels = {name: found for name, found in self._told("units").items() if found}
-        parts = {name: [unit[self.attached] for unit in units] for name, units in levels.items()}
+        parts = {name: [unit.cpu()[self.attached] for unit in units] for name, units in levels.items()}
         self._diagnosis.add(truth.positions, truth.rest, moving, parts)
         spread = truth.rest.amax(0) - truth.rest.amin(0)
         diagonal = self.data.diagonal or float(spread.norm())

@@ -31,7 +31,8 @@ _HELP = {
     "impulse": "on=PART weight_seconds=J direction=D [at=FRAME]: the speed that weight gives in J seconds, at once",
     "wind": "weights=W direction=D [gusts=0..1] [at=FRAME]: on all kernels by their cross-section, until the next",
     "gravity": "weights=W direction=D [at=FRAME]: besides that of the recording, until the next",
-    "pin": "on=PART [at=FRAME]: hold it where it is",
+    "pin": "on=PART [at=FRAME]: hold it where it is; or, of a --scene, SIDE: pin what is on a side from the beginning "
+    'on, e.g. "below z=0.33"',
     "unpin": "[on=PART] [at=FRAME]: let it go",
     "hand": "to=X,Y,Z [frames=N] [turn=X,Y,Z] [hand=H] [at=FRAME]: move the pins to a place relative to rest [scene "
     "units], turned by an axis times an angle [radian], within N frames",
@@ -54,7 +55,7 @@ def add_force_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options for forces and sessions."""
     group = parser.add_argument_group("forces", "Forces in multiples of the weight of their part; each may be given "
                                       "several times. With any, the object starts at rest, or as the one "
-                                      "--sequence does.")  # fmt: skip
+                                      "--sequences does.")  # fmt: skip
     for kind, text in _HELP.items():
         group.add_argument(f"--{kind}", nargs="+", action="append", default=[], metavar="KEY=VALUE", help=text)
     group.add_argument("--session", metavar="FILE", help="replay a session that was recorded (gausim view, --force)")

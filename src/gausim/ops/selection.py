@@ -129,18 +129,18 @@ class Component(Selection):
         return torch.from_numpy(label == chosen).to(scene.means.device)
 
 
-def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
-    """Reads ``AXIS=VALUE``, e.g. ``z=0.33``, as the half-space below (or above) that value.
+def parse_half_space(text: str) -> HalfSpace:
+    """Reads ``[below|above] AXIS=VALUE``, e.g. ``above z=0.33``; without a side it is below.
 
     Raises:
         SceneError: the text has another form.
     """
-    match = re.fullmatch(r"\s*([xyz])\s*=\s*([-+0-9.eE]+)\s*", text)
+    match = re.fullmatch(r"\s*(?:(below|above)\s)?\s*([xyz])\s*=\s*([-+0-9.eE]+)\s*", text)
     try:
-        axis, value = AXES[match[1]], float(match[2])  # type: ignore[index]
+        axis, value = AXES[match[2]], float(match[3])  # type: ignore[index]
     except (TypeError, ValueError) as error:
-        raise SceneError(f"half-space '{text}': expected AXIS=VALUE with axis x, y or z, e.g. z=0.33.") from error
-    return HalfSpace(axis, above=value) if above else HalfSpace(axis, below=value)
+        raise SceneError(f"'{text}': expected 'below AXIS=VALUE' or 'above ...', e.g. 'below z=0.33'.") from error
+    return HalfSpace(axis, above=value) if match and match[1] == "above" else HalfSpace(axis, below=value)
 
 
 def require_pinned(scene: GaussianScene) -> GaussianScene:
@@ -154,10 +154,10 @@ def require_pinned(scene: GaussianScene) -> GaussianScene:
     if not scene.pinned.any() and not scene.surroundings.free:
         z = scene.means[scene.simulated, 2]
         low, high = float(z.amin()), float(z.amax())
-        height = f"z={low + 0.1 * (high - low):.3g}"
+        height = f"below z={low + 0.1 * (high - low):.3g}"
         raise SceneError(
             f"{scene.name}: no kernel is pinned; expected at least one root that holds the object. Store the mask with "
-            f"`gausim inspect SCENE --pin-below {height} --save-masks` (here the lowest tenth; --pin-above where up is "
+            f'`gausim inspect SCENE --pin "{height}" --save-masks` (here the lowest tenth; above where up is '
             f"negative), or select kernels in the data config, 'data.selections={{pinned: \"{height}\"}}'. Where "
             'nothing holds it, set "free": true in dataset.json.'
         )

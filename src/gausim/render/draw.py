@@ -122,8 +122,9 @@ def deformed_appearance(
 @torch.no_grad()
 def draw_still(renderer: Renderer, scene: GaussianScene, cameras: Cameras, **options: Any) -> Rendered:
     """Draws a scene as it stands (B = 1), without loss gradients; the options are those of :func:`draw`."""
-    identity, units = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.long)
-    return draw(renderer, scene, scene.means[None], identity, identity, units, cameras, **options)
+    means = scene.means
+    identity, units = torch.eye(3).to(means)[None, None], torch.zeros(scene.count, dtype=torch.long).to(means.device)
+    return draw(renderer, scene, means[None], identity, identity, units, cameras, **options)
 
 
 @torch.no_grad()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -47,7 +47,9 @@ class Painter:
         self._masses, self._diagonal = masses.float().cpu(), scene.diagonal
         self._moving = (scene.simulated & ~scene.pinned).cpu()
         self._levels = {f"Hierarchy, level {i} ({int(u.max()) + 1} units)": u for i, u in enumerate(units, 1)}
-        self._material = {name.capitalize(): found for name, found in (material or {}).items()}
+        self._material = {
+            name.capitalize(): replace(found, values=found.values.cpu()) for name, found in (material or {}).items()
+        }
         self._highest: dict[str, float] = {}
         self.opacities = self._look.opacities
 
