@@ -56,7 +56,7 @@ def assemble(
     options: AssembleOptions | None = None,
     *,
     scene: Path | None = None,
-    force: bool = False,
+    overwrite: bool = False,
     tick: Tick = silent,
 ) -> dict[str, Any]:
     """Runs the stage.
@@ -77,7 +77,7 @@ def assemble(
     facts = dataset_facts(found, options, out.name)
     files = {**dict(found.files()), **(_scene_files(scene) if scene is not None else {})}
     stage = Stage("assemble", REVISION, files, {"facts": facts, **asdict(options)})
-    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), force=force)
+    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), overwrite=overwrite)
 
 
 def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
         options = chosen(AssembleOptions, given)
-        manifest = assemble(given.pictures, given.out, options, scene=given.scene, force=given.force, tick=tick)
+        manifest = assemble(given.pictures, given.out, options, scene=given.scene, overwrite=given.overwrite, tick=tick)
         return f"{headline(given.out, manifest)}\n{summary(manifest['results'], given.out)}"
 
     return run_command(parser, argv, run)

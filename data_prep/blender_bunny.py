@@ -30,7 +30,7 @@ def make_set(
     connect: Callable[[], BlenderProcess],
     *,
     workers: int = 1,
-    force: bool = False,
+    overwrite: bool = False,
     tick: Tick = silent,
 ) -> dict[str, Any]:
     """Makes a set, all of it or nothing.
@@ -46,7 +46,7 @@ def make_set(
         return make_images(mesh, work, plan, connect(), workers=workers, tick=tick)
 
     stage = Stage("blender_bunny", REVISION, {"mesh": mesh}, plan.settings(), ("numpy",))
-    return run_stage(stage, out, make, force=force)
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("--mesh", type=Path, required=True, metavar="FILE", help="surface of the object, OBJ or PLY")
     add("--out", type=Path, metavar="DIR", help="where to (default: data/NAME)")
-    add("--overwrite", dest="force", action="store_true", help="replace a set of other settings")
+    add("--overwrite", action="store_true", help="replace a set of other settings")
     add("--quick", action="store_true", help="2 sequences of 8 small frames, 4 views, 6 stills")
     group = parser.add_argument_group("sizes and motion", "Defaults are the paper's.")
     for kind in (Plan, Pictures, Soft):
@@ -81,7 +81,7 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     out = arguments.out or Path("data") / plan.name
     manifest = make_set(
         arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python),
-        workers=max(1, arguments.workers), force=arguments.force, tick=tick,
+        workers=max(1, arguments.workers), overwrite=arguments.overwrite, tick=tick,
     )  # fmt: skip
     told = manifest["results"]
     return (

@@ -31,7 +31,7 @@ PACKAGES = ("mujoco", "warp-lang", "numpy", "scipy")
 SHARD, PIECES = 32, "pieces"  # bodies of a shard; folder of those that are in none yet
 
 
-def make_corpus(out: Path, plan: Plan, *, workers: int, force: bool = False, tick: Tick = silent) -> dict[str, Any]:
+def make_corpus(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Makes a corpus.
 
     Raises:
@@ -42,7 +42,7 @@ def make_corpus(out: Path, plan: Plan, *, workers: int, force: bool = False, tic
         raise ConfigError(f"--meshes: two files have one name: {', '.join(settings['meshes'])}.")
     meshes = {f"mesh_{path.name}": path for path in plan.meshes}
     stage = Stage("corpus", REVISION, meshes, settings, PACKAGES)
-    return run_stage(stage, out, lambda work: _make(work, plan, settings, workers, tick), force=force)
+    return run_stage(stage, out, lambda work: _make(work, plan, settings, workers, tick), overwrite=overwrite)
 
 
 def _make(work: Path, plan: Plan, settings: dict[str, Any], workers: int, tick: Tick) -> dict[str, Any]:
@@ -100,7 +100,9 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
             f"The material point method, which moves a fraction of {plan.second:g}, needs Warp. Install it with "
             "`pip install 'gausim[baselines]'`, or give --second 0."
         )
-    manifest = make_corpus(arguments.out, plan, workers=max(1, arguments.workers), force=arguments.force, tick=tick)
+    manifest = make_corpus(
+        arguments.out, plan, workers=max(1, arguments.workers), overwrite=arguments.overwrite, tick=tick
+    )
     if arguments.sheet:
         from data_prep.random_bodies.sheet import write_sheet
         from gausim.data.corpus import Corpus

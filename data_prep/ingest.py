@@ -75,7 +75,7 @@ class IngestOptions(Options):
 
 
 def ingest(
-    films: Path, out: Path, options: IngestOptions | None = None, *, force: bool = False, tick: Tick = silent
+    films: Path, out: Path, options: IngestOptions | None = None, *, overwrite: bool = False, tick: Tick = silent
 ) -> dict[str, Any]:
     """Writes synchronised frames of all sequences.
 
@@ -96,7 +96,7 @@ def ingest(
             raise DataError(f"{films}: sequences have different rates: {rates}. State one with --fps.")
         return {"fps": next(iter(rates.values())), "cameras": list(takes[0].films), "sequences": found}
 
-    return run_stage(stage, out, make, force=force)
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 def _one_take(take: Take, folder: Path, options: IngestOptions, tick: Tick) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def run(arguments: argparse.Namespace, tick: Tick) -> str:
         options = chosen(IngestOptions, arguments)
-        manifest = ingest(arguments.films, arguments.out, options, force=arguments.force, tick=tick)
+        manifest = ingest(arguments.films, arguments.out, options, overwrite=arguments.overwrite, tick=tick)
         return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'])}"
 
     return run_command(parser, argv, run, waiting="synchronising")

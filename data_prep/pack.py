@@ -24,7 +24,7 @@ REVISION = 2
 PARTS = ("dataset.json", "scene.ply", "scene.masks.npz", "scene.json", "rest_points.npz", "rest_mesh.npz", "static")
 
 
-def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False, tick: Tick = silent) -> dict[str, Any]:
+def pack(root: Path, out: Path, *, margin: int = 2, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Packs one object.
 
     Raises:
@@ -40,7 +40,7 @@ def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False, tick: T
     names = [record.name for record in data.sequences]
     inputs = {str(path.relative_to(root)): path for path in _inputs(root, names)}
     stage = Stage("pack", REVISION, inputs, {"margin": margin}, packages=("numpy", "opencv-python-headless"))
-    return run_stage(stage, out, lambda work: _make(data, names, work, margin, tick), force=force)
+    return run_stage(stage, out, lambda work: _make(data, names, work, margin, tick), overwrite=overwrite)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -53,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
-        manifest = pack(given.root, given.out, margin=given.margin, force=given.force, tick=tick)
+        manifest = pack(given.root, given.out, margin=given.margin, overwrite=given.overwrite, tick=tick)
         found = manifest["results"]
         return (
             f"{headline(given.out, manifest)}: {found['sequences']} sequences, {found['frames']} images in "

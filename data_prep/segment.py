@@ -47,7 +47,7 @@ def segment(
     *,
     kind: str = "auto",
     every: int = 1,
-    force: bool = False,
+    overwrite: bool = False,
     tick: Tick = silent,
 ) -> dict[str, Any]:
     """Writes the pictures of ``source`` with their masks as alpha.
@@ -83,7 +83,7 @@ def segment(
             shutil.rmtree(work / folder, ignore_errors=True)
         return {"backend": backend.name, "clips": results}
 
-    return run_stage(stage, out, make, force=force)
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 class _Run:
@@ -227,7 +227,7 @@ def main(argv: list[str] | None = None) -> int:
         cleanup = replace(UNTOUCHED if arguments.backend == "alpha" else Cleanup(), **given(Cleanup, arguments))
         manifest = segment(
             arguments.pictures, arguments.out, backend, cleanup,
-            kind=arguments.kind, every=arguments.every, force=arguments.force, tick=tick,
+            kind=arguments.kind, every=arguments.every, overwrite=arguments.overwrite, tick=tick,
         )  # fmt: skip
         return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"
 

@@ -52,7 +52,7 @@ def select(
     masks: Path | None = None,
     up: str = "z",
     size: int = 360,
-    force: bool = False,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Runs the stage.
 
@@ -84,7 +84,7 @@ def select(
         draw_masks(work / "masks.png", marked, up=up, size=size)
         return _facts(marked)
 
-    return run_stage(stage, out, make, force=force)
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 def _facts(scene: GaussianScene) -> dict[str, Any]:
@@ -144,7 +144,13 @@ def main(argv: list[str] | None = None) -> int:
     def run(given: argparse.Namespace, tick: Tick) -> str:
         selections = {name: getattr(given, name) for name in MASKS if getattr(given, name)}
         manifest = select(
-            given.scene, given.out, selections, masks=given.masks, up=given.up, size=given.size, force=given.force
+            given.scene,
+            given.out,
+            selections,
+            masks=given.masks,
+            up=given.up,
+            size=given.size,
+            overwrite=given.overwrite,
         )
         results = manifest["results"]
         lines = [f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels" for name in MASKS]

@@ -28,14 +28,14 @@ REVISION = 2
 PACKAGES = ("mujoco", "numpy", "scipy", "torch", "opencv-python-headless")
 
 
-def synthesize(out: Path, plan: Plan, *, workers: int, force: bool = False, tick: Tick = silent) -> dict[str, Any]:
+def synthesize(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Makes a set.
 
     Raises:
         DataError: ``out`` holds something else.
     """
     stage = Stage("synthesize", REVISION, {}, asdict(plan), PACKAGES)
-    return run_stage(stage, out, lambda work: _write_all(work, plan, workers, tick), force=force)
+    return run_stage(stage, out, lambda work: _write_all(work, plan, workers, tick), overwrite=overwrite)
 
 
 def _write_all(root: Path, plan: Plan, workers: int, tick: Tick) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = stage_parser("synthesize", __doc__, result=False)
     add = parser.add_argument
     add("--out", type=Path, default=Path("data/synthetic"), help="folder of the set (%(default)s)")
-    add("--overwrite", dest="force", action="store_true", help="replace a set of other settings")
+    add("--overwrite", action="store_true", help="replace a set of other settings")
     add("--quick", action="store_true", help="a tiny set, for tests")
     add("--workers", type=int, default=cores(), help="processes (%(default)s)")
     add_options(parser, Plan, unset=True)
@@ -76,5 +76,7 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     if importlib.util.find_spec("mujoco") is None:
         raise ConfigError("MuJoCo simulates this set. Install it with `pip install 'gausim[synth]'`.")
     plan = replace(QUICK if arguments.quick else Plan(), **given(Plan, arguments))
-    manifest = synthesize(arguments.out, plan, workers=max(1, arguments.workers), force=arguments.force, tick=tick)
+    manifest = synthesize(
+        arguments.out, plan, workers=max(1, arguments.workers), overwrite=arguments.overwrite, tick=tick
+    )
     return f"{headline(arguments.out, manifest)}: {', '.join(plan.objects)}"

@@ -113,9 +113,7 @@ def stage_parser(name: str, text: str, *, epilog: str | None = None, result: boo
     )  # fmt: skip
     if result:
         parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-        parser.add_argument(
-            "--overwrite", dest="force", action="store_true", help="replace a result of other inputs or settings"
-        )
+        parser.add_argument("--overwrite", action="store_true", help="replace a result of other inputs or settings")
     return parser
 
 

@@ -5,8 +5,8 @@ when everything is there, so a directory without ``stage.json`` is never a resul
 where it was, as long as inputs and settings are the same; each item of it is a file that is written at once
 (:func:`gausim.io.files.replacing`).
 
-The function of a stage takes what it reads, ``out`` (the directory of the result), its options, ``force`` (replace a
-result of other inputs or settings) and ``tick`` (told of the progress), and returns the manifest.
+The function of a stage takes what it reads, ``out`` (the directory of the result), its options, ``overwrite`` (replace
+a result of other inputs or settings) and ``tick`` (told of the progress), and returns the manifest.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Stage:
 
 
 def run_stage(
-    stage: Stage, out: Path, make: Callable[[Path], Mapping[str, Any]], *, force: bool = False
+    stage: Stage, out: Path, make: Callable[[Path], Mapping[str, Any]], *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Brings ``out`` to the state that the stage describes, unless it is there already.
 
@@ -63,7 +63,7 @@ def run_stage(
         out: directory of the result.
         make: does it in the directory that it is given, where items of an interrupted attempt may lie; returns what is
             worth telling (plain data), which the manifest keeps as ``results``.
-        force: replace a result of other inputs or settings.
+        overwrite: replace a result of other inputs or settings.
 
     Returns:
         The manifest; ``"made"`` (not in the file) tells whether there was anything to do.
@@ -72,7 +72,7 @@ def run_stage(
         DataError: ``out`` holds something else; nothing was touched.
     """
     key, old = stage.key(), out.with_name(f".{out.name}.old")
-    known = _known(out, key, force=force)
+    known = _known(out, key, overwrite=overwrite)
     if known is not None:
         shutil.rmtree(old, ignore_errors=True)  # of a replacement that was killed at its very end
         return {**known, "made": False}
@@ -160,7 +160,7 @@ def _different(manifest: Mapping[str, Any], key: Mapping[str, Any]) -> list[str]
     return [name for name in key if manifest.get(name) != key[name]]
 
 
-def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] | None:
+def _known(out: Path, key: Mapping[str, Any], *, overwrite: bool) -> dict[str, Any] | None:
     """The manifest in ``out`` if it is of this key; None where the stage has to be made."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
@@ -170,7 +170,7 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
         )
     manifest = read_manifest(out)
     different = _different(manifest, key)
-    if different and not force:
+    if different and not overwrite:
         raise DataError(
             f"{out / MANIFEST}: a result of other {', '.join(different)} is there. Choose another --out, or replace "
             "it with --overwrite."

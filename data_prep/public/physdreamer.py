@@ -35,7 +35,9 @@ TRAIN_FRAMES = 16
 class Options(ImportOptions):
     """Facts that the folder does not contain."""
 
-    view: str | None = option(None, "still from whose place the motion was filmed (the film's name begins with it)")
+    cameras: str | None = option(
+        None, "take this still as the place of the film (default: the film's name begins with it)", metavar="NAME"
+    )
     near: float = option(0.01, "distance to the point clouds [scene units] (%(default)s)", least=1e-9, most=1e6)
     anchor: float = option(
         0.05, "kernels of the object this near to what moves, but not moving, are pinned [scene units] (%(default)s)",
@@ -85,17 +87,17 @@ def read(root: Path, options: Options) -> PublicObject:
 
 def _films(folder: Path, posed: Mapping[str, Posed], options: Options) -> tuple[str, list[Path]]:
     """The still from whose place was filmed, and the films."""
-    if options.view is not None and options.view not in posed:
-        raise ConfigError(f"--view {options.view}: no still of this name; there are {sorted(posed, key=natural)[:12]}.")
+    if options.cameras is not None and options.cameras not in posed:
+        raise ConfigError(f"--cameras {options.cameras}: no such still; there are {sorted(posed, key=natural)[:12]}.")
     found = [p for p in folder.iterdir() if p.suffix.lower() in FILMS] if folder.is_dir() else []
     # The longest name wins: frame_1 is also the beginning of frame_11.
-    of = {film: max((s for s in posed if film.stem.startswith(s)), key=len, default=options.view) for film in found}
+    of = {film: max((s for s in posed if film.stem.startswith(s)), key=len, default=options.cameras) for film in found}
     views = {view for view in of.values() if view is not None}
-    view = options.view or (views.pop() if len(views) == 1 else None)
+    view = options.cameras or (views.pop() if len(views) == 1 else None)
     chosen = sorted((film for film in found if of[film] == view), key=lambda p: natural(p.name))
     if view is None or not chosen:
         raise ConfigError(
-            f"--view: {folder} holds films {[f.name for f in found][:6]} of the stills "
+            f"--cameras: {folder} holds films {[f.name for f in found][:6]} of the stills "
             f"{sorted(map(str, of.values()))[:6]}; expected a film, and the still from whose place it was made."
         )
     return view, chosen

@@ -11,7 +11,7 @@ from gausim.cli.prepare import STAGES
 
 HYDRA = ("train", "config")
 COMMANDS = [[name] for name in cli.COMMANDS if name not in ("prepare", *HYDRA)]
-EVERY = [*COMMANDS, *(["prepare", stage] for stage in STAGES if not stage.startswith("import_"))]
+EVERY = [*COMMANDS, *(["prepare", stage] for stage in STAGES)]
 # Other words for the same: --objects, --sequences and --cameras of names, --overwrite, --pin, --device, --threads.
 WRONG = {
     *("object", "sequence", "camera", "view", "replace", "clobber", "pin-below", "pin-above", "pins", "cuda", "gpu"),

@@ -45,7 +45,7 @@ def test_another_result_is_replaced_only_by_force(stage: Stage, tmp_path: Path, 
     with pytest.raises(DataError, match="--overwrite"):
         run_stage(other, tmp_path / "out", make)
     assert read_manifest(tmp_path / "out")["results"] == {"frames": 6}
-    assert run_stage(other, tmp_path / "out", lambda work: {"frames": 7}, force=True)["results"] == {"frames": 7}
+    assert run_stage(other, tmp_path / "out", lambda work: {"frames": 7}, overwrite=True)["results"] == {"frames": 7}
     assert not (tmp_path / "out" / "a.txt").exists()
 
 
@@ -66,9 +66,9 @@ def test_interrupted_work_goes_on_with_the_same_settings_alone(stage: Stage, tmp
 def test_strangers_are_not_touched(stage: Stage, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("x")
-    for force in (False, True):
+    for overwrite in (False, True):
         with pytest.raises(DataError, match="not the result of a stage"):
-            run_stage(stage, tmp_path / "out", make, force=force)
+            run_stage(stage, tmp_path / "out", make, overwrite=overwrite)
     assert (tmp_path / "out" / "thesis.tex").read_text() == "x"
 
 
