@@ -12,7 +12,7 @@ from torch import Tensor
 from gausim.core import GaussianScene, SimState
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.finite_strain import FiniteStrain
-from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.material import Damping, Links, MaterialTemplate
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.springs import Springs
 from helpers.random_scene import FIELDS
@@ -21,7 +21,8 @@ from helpers.simulators import gausim
 # The settings of `model=gausim`, small.
 NEURAL = {
     "template": partial(
-        MaterialTemplate, modes=9, solid=SolidSettings(0.2, held_inside=True), links=4, hidden=8
+        MaterialTemplate, modes=9, solid=SolidSettings(0.2, 0.0, free_modes=1), links=Links(4, damping=0.0), hidden=8,
+        damping=Damping(0.02, 0.02),
     ),
     "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
     "body_frame": True, "edges": "rest", "attributes": 3,

@@ -18,10 +18,19 @@ from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
 from gausim.models.step.recursion import Solved, Units
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.template import RestTemplate
 from gausim.nn.meshgraphnet import MeshGraphNet
 
 PARTS = {"hierarchy": HierarchySettings, "features": FeatureOptions, "network": MeshGraphNet, "head": Head,
          "rollout": RolloutSettings}  # fmt: skip
+
+# The paper's settings, which tests vary.
+PAPER = {
+    "hierarchy": {"max_neighbours": 16, "edges": "union", "body_frame": False},
+    "features": {"rest_inputs": False, "velocities": True, "centred": False, "attributes": 4, "floor": False},
+    "head": {"output_scale": 1.0, "zero_output": False, "lever": 0.0, "anchor": False},
+    "rollout": {"energy_guard_frames": 0}, "network": {},
+}  # fmt: skip
 
 # As an override of `gausim train`: two levels for an object of a few kernels.
 LEVELS = "model.simulator.hierarchy.levels=[{diameter: 0.7, edge_length: 2.0},{diameter: 0.3, edge_length: 0.4}]"
@@ -55,9 +64,10 @@ def gausim(
     graph_radii: Sequence[float] = (2.0, 0.4),
     **options: Any,
 ) -> GausSim:
-    """A simulator; an option that no part has goes to the constructor."""
+    """The paper's simulator but for the options; one that no part has goes to the constructor."""
+    options = {"template": RestTemplate} | options
     given = {
-        part: {n: options.pop(n) for n in inspect.signature(kind).parameters if n in options}
+        part: PAPER[part] | {n: options.pop(n) for n in inspect.signature(kind).parameters if n in options}
         for part, kind in PARTS.items()
     }
     found = levels(radii, predicted_levels, graph_radii)

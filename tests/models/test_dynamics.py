@@ -114,9 +114,8 @@ def test_a_device_is_asked_now_and_then_and_at_the_end() -> None:
         ({"predicted_levels": (2, 2)}, "coarse to fine"),
         ({"radii": (-0.1, 0.3)}, "coarse to fine"),
         ({"predicted_levels": (), "graph_radii": ()}, "at least one"),
-        ({"edges": "both"}, "'both'; expected one of rest, current, union, intersection"),
-        ({"angle": "degrees"}, "'degrees'; expected one of cos_sin, inner"),
-        ({"clustering": "kmeans"}, "'kmeans'; expected one of ball,.* complete_linkage"),
+        ({"edges": "both"}, "'both'; expected one of rest, union, intersection"),
+        ({"clustering": "kmeans"}, "'kmeans'; expected one of ball, agglomerative"),
     ],
 )
 def test_contradicting_options_are_refused(options, message) -> None:

@@ -12,6 +12,7 @@ from gausim.models.hierarchy.clusters import Hierarchy, build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.template.elastic import ElasticScene, ElasticTemplate, PreparedElastic
+from gausim.models.template.solid import SolidSettings
 from gausim.models.template.springs import neighbour_pairs
 from gausim.models.template.template import Motion
 
@@ -19,7 +20,7 @@ from gausim.models.template.template import Motion
 def _scene(hierarchy: Hierarchy, *, geometric: float = 0.0, period: float = 12.0) -> ElasticScene:
     """Nine modes in double precision, linear unless told otherwise."""
     scene = ElasticScene(
-        hierarchy, 1, modes=9, neighbours=8, period=period, amplitude=0.02, geometric=geometric, solid=0.15
+        hierarchy, 1, modes=9, neighbours=8, period=period, amplitude=0.02, geometric=geometric, solid=SolidSettings(0.15, 0.0, held_inside=False)
     )
     return scene.double().requires_grad_(False)
 

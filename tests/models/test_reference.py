@@ -123,7 +123,7 @@ def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
 
 def test_a_free_body_may_have_more_modes_than_a_held_one() -> None:
     held = replace(_block(), pinned=torch.arange(220) < 20)
-    template = partial(NEURAL["template"], solid=SolidSettings(0.2, held_inside=True, free_modes=2))
+    template = partial(NEURAL["template"], solid=SolidSettings(0.2, 0.0))
     model = make_model([_block(free=True), held], **(NEURAL | {"template": template}))
     assert [model.modal_projection(i).shape[-1] for i in (0, 1)] == [18, 9]
 
@@ -273,7 +273,7 @@ def test_the_static_shape_of_a_recorded_pose_is_computed_once() -> None:
 
 def test_a_bar_pulled_apart_comes_to_rest_stretched_evenly_and_thinner() -> None:
     scene = _bar()
-    model = _frozen(scene, template=partial(NEURAL["template"], solid=SolidSettings(0.12, held_inside=True)))
+    model = _frozen(scene, template=partial(NEURAL["template"], solid=SolidSettings(0.12, 0.0, free_modes=1)))
     apart = torch.tensor([0.2, 0.0, 0.0]).double()
     path = _path(lambda f, x: x + min(f / 20, 1.0) * apart * (x[:, :1] > 1))
     made = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 120, hands=path.pose).positions[-1]

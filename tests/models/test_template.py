@@ -84,8 +84,8 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children() -
 @pytest.mark.parametrize("coarse", [False, True])
 @torch.no_grad()
 def test_inputs_are_made_of_the_centres_of_mass_and_of_the_solved_parents(coarse, monkeypatch) -> None:
-    scene, gravity = make_scene(90, dtype=torch.float64), torch.tensor([0.5, 0.0, -4.0], dtype=torch.float64)
-    model = make_model(scene, coarse_inputs=coarse, gravity=gravity.tolist(), output_scale=5.0, edges="rest")
+    scene = make_scene(90, dtype=torch.float64)
+    model = make_model(scene, coarse_inputs=coarse, output_scale=5.0, edges="rest")
     asked = []
 
     def inputs(*given, **options):
@@ -98,7 +98,7 @@ def test_inputs_are_made_of_the_centres_of_mass_and_of_the_solved_parents(coarse
     hierarchy, mass = model.hierarchies[0], model.masses(model.batch((0,)))[0]
     above = root = scene.means[hierarchy.kernels][hierarchy.levels[2].root]
     for number, (given, coarsely), gradient in zip((2, 1), asked, step.predicted, strict=True):
-        unit, target, parents, edges, size, dt, pull, _ = given
+        unit, target, parents, edges, size, dt, _ = given
         members = [hierarchy.ancestor(0, number) == c for c in range(hierarchy.levels[number].count)]
         for found, values in ((unit.rest, scene.means), (unit.now, state.positions), (unit.before, state.previous)):
             x = values[hierarchy.kernels]
@@ -107,7 +107,7 @@ def test_inputs_are_made_of_the_centres_of_mass_and_of_the_solved_parents(coarse
         density = torch.stack([mass[own].sum() for own in members]) / hierarchy.levels[number].volume
         torch.testing.assert_close(unit.log_density.exp(), density)
         torch.testing.assert_close((target, parents.after[parents.index]), (unit.rest, above))
-        assert coarsely == (coarse and number == 1) and torch.equal(pull, gravity)
+        assert coarsely == (coarse and number == 1)
         assert torch.equal(edges, model.batch((0,)).levels[2 - number].rest_edges)
         torch.testing.assert_close((size, dt), tuple(torch.full_like(size, x) for x in (hierarchy.diagonal, 1 / 24)))
         if number == 2:  # roots do not move

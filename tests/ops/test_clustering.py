@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist
 
 from gausim.ops import clustering
-from gausim.ops.clustering import CLUSTERINGS, agglomerative_clusters, complete_linkage_clusters, k_means
+from gausim.ops.clustering import CLUSTERINGS, agglomerative_clusters, k_means
 
 
 def _count(labels: np.ndarray) -> int:
@@ -50,12 +51,6 @@ def test_separate_clumps_are_found_whatever_the_method(name: str) -> None:
     assert np.array_equal(labels[:, None] == labels, truth[:, None] == truth)
 
 
-def test_complete_linkage_refuses_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clustering, "MAX_COMPLETE_LINKAGE", 20)
-    with pytest.raises(ValueError, match="clustering=agglomerative"):
-        complete_linkage_clusters(_cloud(21), 1.0)
-
-
 def test_k_means_finds_groups_and_is_a_fixed_point() -> None:
     generator = np.random.default_rng(0)
     middles = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]])
@@ -82,7 +77,9 @@ def _sphere(count: int) -> np.ndarray:
 @pytest.mark.parametrize(("seed", "diameter"), [(0, 0.05), (1, 0.2), (2, 0.6), (3, 2.0)])
 def test_equals_complete_linkage_of_all_pairs(seed: int, diameter: float) -> None:
     points = _cube(200, seed) * (1.0, 0.4, 1.7)
-    assert np.array_equal(agglomerative_clusters(points, diameter), complete_linkage_clusters(points, diameter))
+    expected = fcluster(linkage(points, "complete"), diameter, "distance")
+    found = agglomerative_clusters(points, diameter)
+    assert np.array_equal(found[:, None] == found, expected[:, None] == expected)
 
 
 @pytest.mark.parametrize(("points", "diameter"), [(_cube(2_000), 0.12), (_sphere(2_000), 0.5)], ids=["cube", "sphere"])
@@ -90,7 +87,7 @@ def test_groups_keep_the_bound_and_about_as_many_clusters(monkeypatch, points, d
     monkeypatch.setattr(clustering, "MAX_PAIRS", 4_000)  # so few pairs fit that points are merged into groups first
     labels = agglomerative_clusters(points, diameter)
     assert 0.7 * diameter < _widest(points, labels) <= diameter * (1 + 1e-12)
-    assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(points, diameter)), rel=0.25)
+    assert _count(labels) == pytest.approx(fcluster(linkage(points, "complete"), diameter, "distance").max(), rel=0.25)
 
 
 def test_a_grid_full_of_ties_keeps_the_bound_and_the_equivariance() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -160,28 +160,8 @@ class ModalInitialStates(InitialStates):
             basis = (motions.kernels / motions.sizes)[..., :moving]
             most = basis.norm(dim=1).amax(0).clamp_min(TINY)
             self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
-        for scene_id, basis in enumerate(self._basis):
-            self.register_buffer(f"signature_{scene_id}", _signature(basis))
         sizes = [b.shape[-1] + (START if free else 0) for b, free in zip(self._basis, self._is_free, strict=True)]
         self.velocity = nn.ParameterList(torch.zeros(sizes[i]) for i in self.scene_of_sequence)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Also of other machines, whose eigenvectors may have other signs."""
-        for scene_id in range(len(self._basis)):
-            name = f"{prefix}signature_{scene_id}"
-            own = self.get_buffer(f"signature_{scene_id}")
-            saved = state_dict.get(name, own).to(own)
-            state_dict[name] = own
-            if saved.shape != own.shape:
-                continue
-            flipped = (saved * own).sum(0) < 0
-            for sequence_id, scene in enumerate(self.scene_of_sequence):
-                velocity = state_dict.get(f"{prefix}velocity.{sequence_id}")
-                if scene == scene_id and velocity is not None and len(velocity) >= len(flipped):
-                    signs = torch.ones_like(velocity)
-                    signs[: len(flipped)][flipped.to(signs.device)] = -1
-                    state_dict[f"{prefix}velocity.{sequence_id}"] = signs * velocity
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def parameter(self, sequence_id: int) -> nn.Parameter:
         """The amplitudes, and the start of a free body in twelve more numbers."""
@@ -204,9 +184,3 @@ class ModalInitialStates(InitialStates):
         moved = [float(basis[..., 0].norm(dim=1).max()) for basis in self._basis]
         return change * min(most / diagonal for most, diagonal in zip(moved, self._diagonal, strict=True))
 
-
-def _signature(basis: Float[Tensor, "K 3 M"]) -> Float[Tensor, "4 M"]:
-    """Products of every mode with four fixed fields, normalised: they tell its sign."""
-    flat = basis.detach().double().cpu().flatten(0, 1)
-    fields = torch.cos(torch.arange(1, 5)[:, None] * (0.7 + 1.3 * torch.arange(len(flat), dtype=torch.float64)))
-    return (fields @ (flat / flat.norm(dim=0).clamp_min(TINY))).float()

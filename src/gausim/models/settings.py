@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gausim.core import ConfigError
 
-EDGES = ("rest", "current", "union", "intersection")
+EDGES = ("rest", "union", "intersection")
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,7 @@ class HierarchySettings:
             level of diameter 0 means "without hierarchy".
         clustering: as in :func:`gausim.models.hierarchy.clusters.build_hierarchy`.
         max_neighbours: edges per unit.
-        edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
-        share_network: one network for all predicted levels; else one per level (normalisers are common to all).
+        edges: neighbours in ``rest`` space, or the ``union`` / ``intersection`` with those of the current state.
         body_frame: predict in body axes, so that the motion is equivariant to rotations and translations of the scene.
 
     Raises:
@@ -29,14 +28,13 @@ class HierarchySettings:
     """
 
     levels: Sequence[Mapping[str, float]] = (
-        {"diameter": 0.35, "edge_length": 2.0},
-        {"diameter": 0.1, "edge_length": 0.4},
+        {"diameter": 0.4, "edge_length": 2.0},
+        {"diameter": 0.09, "edge_length": 0.3},
     )
     clustering: str = "agglomerative"
-    max_neighbours: int = 16
-    edges: str = "union"
-    share_network: bool = True
-    body_frame: bool = False
+    max_neighbours: int = 8
+    edges: str = "rest"
+    body_frame: bool = True
 
     def __post_init__(self) -> None:
         """Checks the levels and the rule."""
@@ -47,10 +45,10 @@ class HierarchySettings:
                 "model.simulator.hierarchy.levels: expected at least one {diameter, edge_length}, got "
                 f"{[dict(level) for level in self.levels]}."
             )
-        found = [float(level["diameter"]) for level in self.levels]
-        if found != sorted(set(found), reverse=True) or found[-1] < 0:
+        diameters = [float(level["diameter"]) for level in self.levels]
+        if diameters != sorted(set(diameters), reverse=True) or diameters[-1] < 0:
             raise ConfigError(
-                f"model.simulator.hierarchy.levels: expected falling diameters, coarse to fine, got {found}."
+                f"model.simulator.hierarchy.levels: expected falling diameters, coarse to fine, got {diameters}."
             )
 
     @property
@@ -83,4 +81,4 @@ class RolloutSettings:
     """
 
     cuda_graph: bool = False
-    energy_guard_frames: int = 0
+    energy_guard_frames: int = 36

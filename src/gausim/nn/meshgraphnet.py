@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint as recomputed
 
 from gausim.core import ConfigError
-from gausim.nn.mlp import ACTIVATIONS, mlp
+from gausim.nn.mlp import mlp
 
 PRECISIONS = ("fp32", "bf16")
-NORMS = ("pre", "post", "joint")
+NORMS = ("pre", "joint")
 
 
 class _SplitLayer(nn.Module):
@@ -42,41 +38,17 @@ class _SplitLayer(nn.Module):
         return nodes + self.node(torch.cat((seen, received), -1)), edges
 
 
-class _Layer(nn.Module):
-    """Layer with any norm and activation.
-
-    With norm "post" the updates are normalised instead of their inputs (Pfaff et al. 2021).
-    """
-
-    def __init__(self, hidden: int, *, norm: str, activation: str) -> None:
-        super().__init__()
-        self.post = norm == "post"
-        self.edge_norm, self.node_norm = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
-        self.edge = mlp((3 * hidden, hidden, hidden), activation)
-        self.node = mlp((2 * hidden, hidden, hidden), activation)
-
-    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
-        source, destination = edge_index
-        seen = nodes if self.post else self.node_norm(nodes)
-        own = edges if self.post else self.edge_norm(edges)
-        update = self.edge(torch.cat((own, seen.index_select(0, source), seen.index_select(0, destination)), -1))
-        edges = edges + (self.edge_norm(update) if self.post else update)
-        received = torch.zeros_like(nodes).index_add(0, destination, edges)
-        update = self.node(torch.cat((seen, received), -1))
-        return nodes + (self.node_norm(update) if self.post else update), edges
-
-
 class _JointLayer(nn.Module):
     """The layer of the authors' code: MLPs of three linear layers, with one LayerNorm over all inputs of each.
 
     The summed messages are normalised with the node, so that the node stream does not grow from layer to layer.
     """
 
-    def __init__(self, hidden: int, *, activation: str) -> None:
+    def __init__(self, hidden: int) -> None:
         super().__init__()
         self.edge_norm, self.node_norm = nn.LayerNorm(3 * hidden), nn.LayerNorm(2 * hidden)
-        self.edge = mlp((3 * hidden, hidden, hidden, hidden), activation)
-        self.node = mlp((2 * hidden, hidden, hidden, hidden), activation)
+        self.edge = mlp((3 * hidden, hidden, hidden, hidden))
+        self.node = mlp((2 * hidden, hidden, hidden, hidden))
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         source, destination = edge_index
@@ -89,7 +61,7 @@ class _JointLayer(nn.Module):
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
-    ``precision``, ``checkpoint`` and ``compile`` do not change the parameters: checkpoints fit all their values.
+    ``precision`` and ``compile`` do not change the parameters: checkpoints fit all their values.
     """
 
     def __init__(
@@ -98,12 +70,10 @@ class MeshGraphNet(nn.Module):
         node_features: int,
         edge_features: int,
         outputs: int,
-        hidden: int = 128,
-        layers: int = 16,
+        hidden: int = 48,
+        layers: int = 3,
         norm: str = "pre",
-        activation: str = "silu",
         precision: str = "fp32",
-        checkpoint: bool = False,
         compile: bool = False,
     ) -> None:
         """Builds the network.
@@ -114,33 +84,26 @@ class MeshGraphNet(nn.Module):
             outputs: number of outputs per node.
             hidden: width of all hidden layers.
             layers: message-passing layers.
-            norm: LayerNorm ``pre`` (of the inputs of a residual update), ``post`` (of the update), or ``joint``: the
-                authors' layers, with three linear layers per MLP, one LayerNorm over all inputs of each, none before
-                the decoder, and ReLU in encoders and decoder.
-            activation: ``silu`` or ``relu``.
+            norm: LayerNorm ``pre`` (of the inputs of a residual update), or ``joint``: the authors' layers, with three
+                linear layers per MLP, one LayerNorm over all inputs of each, none before the decoder, and ReLU in
+                encoders and decoder.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
-            checkpoint: keep only the streams before every few layers (2 of 16) and recompute the others in the backward
-                pass, with the same loss gradients bit by bit.
             compile: compile the layers at the first call, for any number of nodes and edges; needs a C++ compiler on
                 the CPU and triton on a GPU. It pays on a GPU.
 
         Raises:
-            ConfigError: unknown precision, norm or activation.
+            ConfigError: unknown precision or norm.
         """
         super().__init__()
-        for name, given, known in (
-            ("precision", precision, PRECISIONS),
-            ("norm", norm, NORMS),
-            ("activation", activation, tuple(ACTIVATIONS)),
-        ):
+        for name, given, known in (("precision", precision, PRECISIONS), ("norm", norm, NORMS)):
             if given not in known:
                 raise ConfigError(f"model.simulator.network.{name} is '{given}'; expected one of {', '.join(known)}.")
-        self.precision, self.checkpointed, self.compiled = precision, checkpoint, compile
-        ends = "relu" if norm == "joint" else activation
+        self.precision, self.compiled = precision, compile
+        ends, layer = ("relu", _JointLayer) if norm == "joint" else ("silu", _SplitLayer)
         self.node_encoder = mlp((node_features, hidden, hidden), ends)
         self.edge_encoder = mlp((edge_features, hidden, hidden), ends)
-        self.processor = nn.ModuleList(_layer(hidden, norm, activation) for _ in range(layers))
+        self.processor = nn.ModuleList(layer(hidden) for _ in range(layers))
         self.norm = nn.LayerNorm(hidden) if norm == "pre" else nn.Identity()
         self.decoder = mlp((hidden, hidden // 2, hidden // 4, outputs), ends)
 
@@ -166,28 +129,6 @@ class MeshGraphNet(nn.Module):
             for layer in modules:
                 if layer._compiled_call_impl is None:  # all have the same code, which is compiled once
                     layer.compile(dynamic=True)
-        layers: list[Callable] = [layer if compiled else layer.forward for layer in modules]
-        if not (self.checkpointed and torch.is_grad_enabled()):
-            return _run(layers, nodes, edges, edge_index)[0]
-        # 16 layers keep 16 / 2 streams, plus 2 x 2 arrays while a segment is recomputed: near the minimum.
-        size = max(1, math.isqrt(len(layers) // 2))
-        for first in range(0, len(layers), size):
-            segment = layers[first : first + size]
-            nodes, edges = recomputed(
-                _run, segment, nodes, edges, edge_index, use_reentrant=False, preserve_rng_state=False
-            )
+        for layer in modules:
+            nodes, edges = (layer if compiled else layer.forward)(nodes, edges, edge_index)
         return nodes
-
-
-def _layer(hidden: int, norm: str, activation: str) -> nn.Module:
-    if (norm, activation) == ("pre", "silu"):
-        return _SplitLayer(hidden)
-    if norm == "joint":
-        return _JointLayer(hidden, activation=activation)
-    return _Layer(hidden, norm=norm, activation=activation)
-
-
-def _run(layers: Sequence[Callable], nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
-    for layer in layers:
-        nodes, edges = layer(nodes, edges, edge_index)
-    return nodes, edges

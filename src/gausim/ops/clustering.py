@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 
 from gausim.kernels import agglomeration, kdtree
 from gausim.kernels.announce import announced
 
-# Above this number of points the pairwise distances of complete linkage take more than 1.6 GB.
-MAX_COMPLETE_LINKAGE = 20_000
 LLOYD_ITERATIONS = 8
 # Agglomeration keeps every pair within the diameter in memory, 48 bytes each. With more pairs than this, points are
 # first merged into groups of at most these fractions of the diameter, the smallest that fits.
@@ -69,26 +66,10 @@ def ball_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.n
     return _relabel(points, labels)
 
 
-def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
-    """Complete-linkage agglomerative clustering cut at ``diameter``; the reference, O(N^2) memory.
-
-    Raises:
-        ValueError: more than 20,000 points; use :func:`agglomerative_clusters`.
-    """
-    if len(points) > MAX_COMPLETE_LINKAGE:
-        raise ValueError(
-            f"complete linkage of {len(points)} points needs {len(points) ** 2 * 4 / 1e9:.0f} GB; "
-            f"the limit is {MAX_COMPLETE_LINKAGE} points. Use clustering=agglomerative, the same in near-linear memory."
-        )
-    if len(points) == 1:
-        return np.zeros(1, np.int64)
-    return _relabel(points, fcluster(linkage(points, "complete"), diameter, "distance"))
-
-
 def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
     """Near-linear complete linkage cut at ``diameter`` [scene units]: no two members are farther apart.
 
-    The clusters are those of :func:`complete_linkage_clusters` (except for ties) if at most 8 million pairs of
+    The clusters are those of all pairs (except for ties) if at most 8 million pairs of
     points lie within the diameter. With more pairs, neighbouring points are first merged into groups much smaller
     than the diameter; the distance of two groups is that of their farthest points, so the bound holds exactly.
     """
@@ -131,7 +112,6 @@ def _close_groups(
 
 CLUSTERINGS = {
     "ball": ball_clusters,
-    "complete_linkage": complete_linkage_clusters,
     "agglomerative": agglomerative_clusters,
 }
 

@@ -80,15 +80,13 @@ def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
     """Edges of a level whose units are at ``positions`` [scene units], sorted by destination, then source.
 
     Args:
-        rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
+        rule: neighbours at ``rest``, or their ``union`` or ``intersection`` with those of the current state.
         level: the units.
         positions: their current positions.
     """
     if rule == "rest":
         return level.rest_edges
     current = batched_radius_edges(positions, level.offsets, level.radii, level.max_neighbours)
-    if rule == "current":
-        return current
     rest, now = (edge_codes(edges, level.count) for edges in (level.rest_edges, current))
     combined = combine_codes(rest, now, level.count, rule=rule)
     return coded_edges(combined[combined < no_edge(level.count)], level.count)
@@ -100,9 +98,7 @@ def fixed_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
     E does not depend on the positions, and the host is not synchronised.
     """
     codes = neighbour_codes(positions, level.member, level.device_radii, level.max_neighbours)
-    if rule != "current":
-        codes = combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule)
-    return coded_edges(codes, level.count)
+    return coded_edges(combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule), level.count)
 
 
 @dataclass(frozen=True, eq=False)

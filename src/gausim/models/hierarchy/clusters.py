@@ -68,8 +68,8 @@ def build_hierarchy(
     Args:
         scene: the rest scene; at least one kernel must be pinned, unless it is free.
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
-        clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (a greedy cover; more clusters)
-            or ``complete_linkage`` (of all pairs; the reference).
+        clustering: ``agglomerative`` (complete linkage in near-linear memory) or ``ball`` (a greedy cover; more
+            clusters).
         axes: (3, 3), rows are the axes of the bounding box whose diagonal is the unit of length; the scene's axes when
             None. With body axes the units do not depend on the orientation of the scene.
 

@@ -78,7 +78,7 @@ class MaterialDynamics(SceneDynamics):
         if template.has_drag:
             changed[:, 1] += math.log(damping)
         else:
-            template.thickened[self.scene_id] = damping
+            template.viscosity_scale[self.scene_id] = damping
         self.model.attributes[self.scene_id].data.copy_(changed)
         self.energy_ceiling = None if self._ceiling is None else stiffness * self._ceiling  # the same motion
 

@@ -16,7 +16,6 @@ from gausim.models.step.recursion import Solved, Units
 TINY = 1e-6
 # Nearness to the floor, and the floor's normal times the nearness; the last node features.
 FLOOR_FEATURES = 4
-ANGLES = ("cos_sin", "inner")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +33,6 @@ class FeatureOptions:
     """Choice of the network's input features.
 
     Attributes:
-        angle: ``cos_sin`` of the difference of the two angles (scale-free), or ``inner``, the difference of products.
         rest_inputs: add displacements, rest-space edge vectors and the template's prediction.
         coarse_inputs: below the top level use positions of the coarse prediction instead of the current state.
         velocities: use velocities and accelerations; without them, levers X_i - X_p, displacements and the parent's
@@ -42,29 +40,23 @@ class FeatureOptions:
         centred: positions in the middle of the step, where the template takes its forces: with its prediction they are
             (x_{t+1} + 2 x_t + x_{t-1}) / 4. What turns round in every frame is not seen there, and not driven on.
         attributes: material attributes per unit.
-        gravity: acceleration [scene units / s^2].
         normaliser_floor: smallest standard deviation of a normalised input.
         floor: nearness of the units to the floor, in models of which a scene has one.
 
     Raises:
-        ConfigError: an unknown angle, or neither velocities nor rest_inputs.
+        ConfigError: neither velocities nor rest_inputs.
     """
 
-    angle: str = "cos_sin"
-    rest_inputs: bool = False
+    rest_inputs: bool = True
     coarse_inputs: bool = False
-    velocities: bool = True
-    centred: bool = False
-    attributes: int = 4
-    gravity: Sequence[float] = (0.0, 0.0, 0.0)
+    velocities: bool = False
+    centred: bool = True
+    attributes: int = 8
     normaliser_floor: float = 1e-2
-    floor: bool = False
+    floor: bool = True
 
     def __post_init__(self) -> None:
         """Checks the choices."""
-        object.__setattr__(self, "gravity", tuple(self.gravity))  # a configuration has a list
-        if self.angle not in ANGLES:
-            raise ConfigError(f"model.simulator.features.angle is '{self.angle}'; expected one of {', '.join(ANGLES)}.")
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
                 "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
@@ -100,7 +92,7 @@ class FeatureOptions:
     @property
     def edge_size(self) -> int:
         """Number of edge features."""
-        return self.edge_normalised + (2 if self.angle == "cos_sin" else 1)
+        return self.edge_normalised + 2
 
 
 def safe_norm(x: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 1"]:
@@ -115,14 +107,13 @@ def network_inputs(
     edge_index: Int[Tensor, "2 E"],
     size: Float[Tensor, "N 1"],
     dt: Float[Tensor, "N 1"],
-    gravity: Float[Tensor, " 3"],
     options: FeatureOptions,
     *,
     coarse: bool = False,
 ) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
     """Node and edge features of the units of one level, from their graph and their solved parents.
 
-    Nodes have the inertial acceleration of the parent's frame plus gravity and the local velocity, and with
+    Nodes have the inertial acceleration of the parent's frame and the local velocity, and with
     ``rest_inputs`` the displacement and the velocity to the coarse prediction; or what ``velocities=False`` stands for.
     ``target`` are the units' template positions, ``size`` the diagonals of their scenes [scene units]; ``coarse``
     selects positions of the coarse prediction instead of the current ones.
@@ -134,7 +125,7 @@ def network_inputs(
     parent = UnitState(*(parents / size).unbind())
     edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
     if options.velocities:
-        inertial = gravity / size - (parent.after - 2 * parent.now + parent.before) / dt**2
+        inertial = -(parent.after - 2 * parent.now + parent.before) / dt**2
         local = own.after - parent.after if coarse else own.now - parent.now
         columns = [inertial, (local - (own.before - parent.before)) / dt]
         if options.rest_inputs:
@@ -175,15 +166,13 @@ def edge_features(
     if options.rest_inputs:
         columns += [rest, now - rest]
     about = torch.stack((barycentre.rest, centre), 1).index_select(0, d)
-    columns.append(_turned(destination[:, :2] - about, source[:, :2] - about, options.angle))
+    columns.append(_angle_change(destination[:, :2] - about, source[:, :2] - about))
     return torch.cat(columns, -1)
 
 
-def _turned(a: Float[Tensor, "E 2 3"], b: Float[Tensor, "E 2 3"], kind: str) -> Float[Tensor, "E C"]:
-    """Change of the angle between two vectors from rest to now; axis 1 of both is (rest, now)."""
+def _angle_change(a: Float[Tensor, "E 2 3"], b: Float[Tensor, "E 2 3"]) -> Float[Tensor, "E 2"]:
+    """Cosine and sine of the change of the angle between two vectors from rest to now; axis 1 of both is (rest, now)."""
     dot = (a * b).sum(-1, keepdim=True)
-    if kind == "inner":
-        return dot[:, 1] - dot[:, 0]
     scale = safe_norm(a) * safe_norm(b)
     # The floor is the square of that of lengths: a unit on its barycentre gives 0, not 1 / length.
     across = torch.linalg.cross(a, b).square().sum(-1, keepdim=True).add(TINY**4).sqrt()

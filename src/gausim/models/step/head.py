@@ -35,10 +35,10 @@ class Head:
         anchor: subtract the network's outputs at rest, so that rest is an equilibrium.
     """
 
-    output_scale: float = 1.0
-    zero_output: bool = False
-    lever: float = 0.0
-    anchor: bool = False
+    output_scale: float = 0.1
+    zero_output: bool = True
+    lever: float = 0.02
+    anchor: bool = True
 
     @property
     def outputs(self) -> int:

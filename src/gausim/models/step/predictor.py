@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import cast
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -36,33 +35,27 @@ def with_floor_columns(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -
 class DeformationPredictor(nn.Module):
     """Predictor of F of every unit from the states of the unit, its parent and its neighbours."""
 
-    gravity: Tensor
-
     def __init__(
         self,
         *,
-        networks: int,
         features: FeatureOptions,
         network: Callable[..., nn.Module],
         head: Head,
         edges: str,
         conserve_mass: bool,
     ) -> None:
-        """Builds the networks (one, or one per predicted level) and the normalisers of their inputs.
+        """Builds the network, which all predicted levels share, and the normalisers of its inputs.
 
         ``network`` is called with node_features=, edge_features= and outputs=.
         """
         super().__init__()
         self.features, self.edges, self.head, self._conserve_mass = features, edges, head, conserve_mass
-        gravity = torch.tensor([float(g) for g in features.gravity])
-        self.register_buffer("gravity", gravity, persistent=False)
         self.node_normaliser = RunningNormaliser(features.node_normalised, floor=features.normaliser_floor)
         self.edge_normaliser = RunningNormaliser(features.edge_normalised, floor=features.normaliser_floor)
         sizes = {"node_features": features.node_size, "edge_features": features.edge_size, "outputs": head.outputs}
-        made = [network(**sizes) for _ in range(networks)]
-        for one in made if head.zero_output else ():
-            initialise_zero(cast(nn.Sequential, one.decoder))
-        self.network: nn.Module = made[0] if networks == 1 else nn.ModuleList(made)
+        self.network = network(**sizes)
+        if head.zero_output:
+            initialise_zero(cast(nn.Sequential, self.network.decoder))
 
     def forward(
         self, level: LevelBatch, unit: Units, above: Solved, target: Float[Tensor, "N 3"], position: int
@@ -71,19 +64,18 @@ class DeformationPredictor(nn.Module):
 
         ``above`` are the solved parents, ``target`` the units' template positions [scene units].
         """
-        network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
         coarse = self.features.coarse_inputs and position > 0
         fixed = self._fixes_shapes(unit.now)
         edge_index = (fixed_edges if fixed else exact_edges)(self.edges, level, unit.now)
         # Edges of the dummy node come last; their features reach no unit, so those of any node serve.
         present = edge_index.clamp_max(level.count - 1) if fixed else edge_index
         nodes, edges = network_inputs(
-            unit, target, above, present, level.length, level.dt, self.gravity, self.features, coarse=coarse
+            unit, target, above, present, level.length, level.dt, self.features, coarse=coarse
         )
         nodes, edges = self.node_normaliser(nodes), self.edge_normaliser(edges)
         if fixed:
             nodes = nn.functional.pad(nodes, (0, 0, 0, 1))
-        output: Tensor = network(nodes, edges, edge_index)[: level.count]
+        output: Tensor = self.network(nodes, edges, edge_index)[: level.count]
         return output
 
     def deformation_gradient(

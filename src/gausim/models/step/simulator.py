@@ -20,12 +20,13 @@ from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.scene_model import SceneModel
-from gausim.models.template.template import Motion, RestTemplate, Template
+from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.template import Motion, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 
 DEFAULT_HIERARCHY, DEFAULT_FEATURES = HierarchySettings(), FeatureOptions()
-PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
+DEFAULT_HEAD, DEFAULT_ROLLOUT = Head(), RolloutSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +51,11 @@ class GausSim(SceneModel):
         hierarchy: HierarchySettings = DEFAULT_HIERARCHY,
         features: FeatureOptions = DEFAULT_FEATURES,
         network: Callable[..., nn.Module] = MeshGraphNet,
-        head: Head = PLAIN_HEAD,
-        template: Callable[..., Template] = RestTemplate,
+        head: Head = DEFAULT_HEAD,
+        template: Callable[..., Template] = MaterialTemplate,
         conserve_mass: bool = True,
         conserve_momentum: bool = True,
-        rollout: RolloutSettings = PLAIN_ROLLOUT,
+        rollout: RolloutSettings = DEFAULT_ROLLOUT,
     ) -> None:
         """Builds the hierarchies, the template and the predictor.
 
@@ -72,14 +73,9 @@ class GausSim(SceneModel):
             rollout: CUDA graphs, and the energy guard of rollouts without loss gradients.
 
         Raises:
-            ConfigError: incompatible settings, or not one frame rate per scene.
+            ConfigError: not one frame rate per scene.
             SceneError: a scene has no pinned kernel, or no free one.
         """
-        if hierarchy.body_frame and any(features.gravity):
-            raise ConfigError(
-                "model.simulator.features.gravity is a direction of the scene: set "
-                "model.simulator.hierarchy.body_frame=false with it."
-            )
         super().__init__(scenes, fps, hierarchy, features.attributes)
         self.conserve_momentum, self.rollout = conserve_momentum, rollout
         self.template = template(
@@ -88,8 +84,7 @@ class GausSim(SceneModel):
         )  # fmt: skip
         self.shape_bodies(self.template.solid)
         self.predictor = DeformationPredictor(
-            networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features.of(scenes),
-            network=network, head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
+            features=features.of(scenes), network=network, head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch, *, isolated: bool = False, driven: bool = False) -> Prepared:

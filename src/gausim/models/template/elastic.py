@@ -46,7 +46,7 @@ class ElasticScene(nn.Module):
     def __init__(
         self,
         hierarchy: Hierarchy, finest: int, *,
-        modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: SolidSettings | float,
+        modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: SolidSettings,
     ) -> None:  # fmt: skip
         """Initialises from ``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric``."""
         super().__init__()
@@ -56,7 +56,7 @@ class ElasticScene(nn.Module):
         mass = mass / mass.mean()
         pinned = level.pinned.numpy()
         finer = hierarchy.levels[0]
-        kernels, held, solid = finer.rest.double().numpy(), finer.pinned.numpy(), SolidSettings.of(solid)
+        kernels, held = finer.rest.double().numpy(), finer.pinned.numpy()
         body = solid_body(
             kernels, held, rest, mass, pinned,
             modes=modes, spacing=solid.size(kernels, hierarchy.diagonal), inside=solid.held_inside,
@@ -165,7 +165,7 @@ class ElasticTemplate(Template):
         period: float = 8.0,
         amplitude: float = 0.02,
         geometric: float = 1.0,
-        solid: SolidSettings | float = 0.12,
+        solid: SolidSettings = SolidSettings(0.12, 0.0),
         attributes: int = 0,
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
@@ -180,7 +180,7 @@ class ElasticTemplate(Template):
             period: initial period of the lowest mode [frames].
             amplitude: typical displacement [diagonals], the size of initial velocities.
             geometric: initial factor on the springs' nonlinear force, trained.
-            solid: the solid body; a number stands for the spacing of its grid [diagonals].
+            solid: the solid body.
             attributes: number of attributes per unit, unused: the material of a scene is in its matrices.
             frames: axes of the scenes, unused.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).

@@ -72,17 +72,17 @@ REFERENCE_FPS = 24.0
 class Links:
     """Links between neighbouring units."""
 
-    neighbours: int = 12  # of a unit
+    neighbours: int = 24  # of a unit
     linear: float = 0.3  # initial stiffness and inertia of all links over the body's
-    damping: float = 0.0  # resistance to the growth of length or strain over that to it [frames at 24 per second]
+    damping: float = 0.03  # resistance to the growth of length or strain over that to it [frames at 24 per second]
 
 
 @dataclass(frozen=True)
 class Damping:
     """Damping at the beginning."""
 
-    drag: float  # c_0 [1 / frame]; 0: none, whatever is trained
-    viscosity: float  # c_1 [frames]
+    drag: float = 0.0015  # c_0 [1 / frame]; 0: none, whatever is trained
+    viscosity: float = 0.0015  # c_1 [frames]
     trained: bool = True  # both; else they stay as they are
 
 
@@ -119,13 +119,13 @@ class MaterialTemplate(Template):
         attributes: int,
         frames: Sequence[np.ndarray],
         modes: int = 48,
-        solid: SolidSettings | float = 0.12,
-        links: Links | int = Links(),
+        solid: SolidSettings = SolidSettings(),
+        links: Links = Links(),
         law: str = "solid",
         own_matrices: bool = False,
         hidden: int = 48,
         period: float = 8.0,
-        damping: Damping | float = 0.02,
+        damping: Damping = Damping(),
         conserve_volume: bool = True,
     ) -> None:
         """Builds the scenes and the decoders; for the equations see the module's docstring.
@@ -136,13 +136,13 @@ class MaterialTemplate(Template):
             attributes: number of attributes per unit.
             frames: axes (3, 3) of each scene in which the template works.
             modes: number of modes.
-            solid: the solid body; a number stands for the spacing of its grid [diagonals].
-            links: links between units; a number stands for so many neighbours.
+            solid: the solid body.
+            links: links between units.
             law: what is nonlinear: ``solid``, the finite strain of the body's cells, or ``springs``, further links.
             own_matrices: also train factors on the decoded matrices of each scene, so that its modes may mix.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
-            damping: initial c_0 and c_1; a number stands for both [1 / frame, frames].
+            damping: initial c_0 and c_1.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
@@ -156,9 +156,7 @@ class MaterialTemplate(Template):
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
         self.conserve_volume = conserve_volume
-        self.links = Links(links) if isinstance(links, int) else links
-        self.springs = SPRINGS_OF_LAW[law]
-        self.solid = SolidSettings.of(solid)
+        self.links, self.solid, self.springs = links, solid, SPRINGS_OF_LAW[law]
         made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=law == "solid")
         counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
@@ -166,14 +164,13 @@ class MaterialTemplate(Template):
         )
         own = [OwnMatrices(self.body(i).modes.shape[-1]) for i in range(len(hierarchies))] if own_matrices else []
         self.scenes = nn.ModuleList(own)
-        damping = Damping(damping, damping) if isinstance(damping, int | float) else damping
         if damping.drag < 0 or damping.viscosity <= 0:
             raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
         self.log_k = 2 * math.log(2 * math.pi / period)
         self.initial, self.has_drag = damping, damping.drag > 0
         logs = [self.log_drag if self.has_drag else -math.inf, math.log(damping.viscosity)]
         self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
-        self.thickened: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
+        self.viscosity_scale: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.damping = nn.Parameter(torch.zeros(2), requires_grad=damping.trained)
         self.unit_decoder = mlp((attributes, hidden, 3))
@@ -214,7 +211,7 @@ class MaterialTemplate(Template):
     def _damping(self, scene_id: int) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """c_0 and c_1 of a scene [1 / frame, frames]."""
         drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
-        return drag, viscosity * self.thickened.get(scene_id, 1.0)
+        return drag, viscosity * self.viscosity_scale.get(scene_id, 1.0)
 
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float | Tensor

@@ -36,17 +36,12 @@ Solver = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class SolidSettings:
-    """How the body around the kernels is modelled; a number in the place of these stands for ``spacing``."""
+    """How the body around the kernels is modelled."""
 
-    spacing: float = 0.12  # of the grid [diagonals]
-    least: float = 0.0  # the grid's least spacing, in median distances of a kernel to its fourth neighbour
-    held_inside: bool = False  # pinned kernels hold what is within the body beside them, too; not in earlier runs
-    free_modes: int = 1  # times as many modes for a body that nothing holds: an impact deforms it where it touches
-
-    @classmethod
-    def of(cls, solid: SolidSettings | float) -> SolidSettings:
-        """The settings that a number stands for."""
-        return solid if isinstance(solid, SolidSettings) else cls(solid)
+    spacing: float = 0.08  # of the grid [diagonals]
+    least: float = 1.7  # the grid's least spacing, in median distances of a kernel to its fourth neighbour
+    held_inside: bool = True  # pinned kernels hold what is within the body beside them, too
+    free_modes: int = 2  # times as many modes for a body that nothing holds: an impact deforms it where it touches
 
     def size(self, kernels: np.ndarray, diagonal: float) -> float:
         """Spacing of the grid of a body [scene units]: where kernels (K, 3) are sparse, a fine one has holes."""
@@ -121,15 +116,13 @@ class SolidBody:
         """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
 
         Returns:
-            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, their
+            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units, their
             displacement gradients (N, 3, 3, M) [1 / scene units], and :meth:`strains`.
         """
         phi, slope = self.at(rest)
         phi[pinned], slope[pinned] = 0, 0
-        flat = phi.reshape(-1, phi.shape[-1])
-        scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
         values = np.maximum(self.values, 1e-4 * self.values[-1])
-        return values / values[0], phi * scale, slope * scale, self.strains(rest) * scale
+        return values / values[0], phi, slope, self.strains(rest)
 
 
 def solid_body(
@@ -152,7 +145,8 @@ def solid_body(
         rest: rest positions of the units (N, 3) [scene units].
         mass: masses of the units (N,); the modes are orthonormal under them.
         pinned: mask of the pinned units (N,).
-        modes: number of modes; at most three per free unit are returned.
+        modes: number of modes; at most three per free unit are returned. The largest component of each at a free
+            unit is positive.
         spacing: spacing of the grid [scene units].
         inside: also hold what is nearest to pinned kernels within the body.
         curved: of so many of the lowest modes derivatives join the modes, up to half of them (:func:`derivatives`).
@@ -168,8 +162,11 @@ def solid_body(
     solve = _solver(whole)
 
     def made(eigenvalues: np.ndarray, vectors: np.ndarray, vibrations: int) -> SolidBody:
+        # The signs of eigenvectors differ between machines. What is trained in the modes must mean the same on all.
+        moved = carry @ vectors
+        signs = np.sign(moved[np.abs(moved).argmax(0), np.arange(moved.shape[1])])
         field = np.zeros((3 * grid.size, vectors.shape[1]))
-        field[used] = vectors
+        field[used] = vectors * signs
         return SolidBody(grid, eigenvalues, field.reshape(3, grid.size, -1), body.centres, body.weights, vibrations)
 
     eigenvalues, vectors = lowest(solve, carry, modes, rigid)
