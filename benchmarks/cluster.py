@@ -7,8 +7,8 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from scipy.cluster.hierarchy import fcluster, linkage
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 
 from benchmarks.harness import Options, Row, medians
 from gausim.ops.clustering import agglomerative_clusters

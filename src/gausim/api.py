@@ -18,7 +18,7 @@ import torch
 from gausim.compose.build import load_run
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import run_objects
-from gausim.core import Cameras, DataError, Renderer, SteppedFrame, Trajectory
+from gausim.core import Cameras, DataError, Frame, Renderer, Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
@@ -45,7 +45,7 @@ class Simulation:
         self._look: SceneAppearance | None = None
 
     @property
-    def frame(self) -> SteppedFrame:
+    def frame(self) -> Frame:
         """The latest frame: positions, deformation gradients and rotations."""
         return self.interaction.frame
 
@@ -54,7 +54,7 @@ class Simulation:
         """All frames since the session began, the initial one first."""
         return self.interaction.trajectory()
 
-    def step(self, n: int = 1) -> SteppedFrame:
+    def step(self, n: int = 1) -> Frame:
         """Takes ``n`` steps and returns the latest frame.
 
         Raises:

@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 
-from gausim.core import GaussianScene, SimState, SteppedFrame
+from gausim.core import Frame, GaussianScene, SimState
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -36,7 +36,7 @@ def _interaction(*, seed: int = 0, ceiling: float | None = None, **options: obje
     return Interaction(scene, dynamics, dynamics.masses, initial, made_with=made_with, units=units, **options)
 
 
-def steps(interaction: Interaction, count: int) -> SteppedFrame:
+def steps(interaction: Interaction, count: int) -> Frame:
     """Takes some steps, at least one; the last frame."""
     for _ in range(count):
         frame = interaction.step()

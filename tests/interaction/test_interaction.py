@@ -10,7 +10,7 @@ import torch
 from helpers.column import steps
 from msgspec.structs import replace as changed
 
-from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
+from gausim.core import ConfigError, DataError, DivergenceError, Frame, SimState, Steppable, Stepper
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
@@ -105,7 +105,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
 
         def __init__(self, initial: SimState) -> None:
             self.state, self._eye = initial, torch.eye(3)[None]
-            self.frame = SteppedFrame(initial.positions, self._eye, self._eye)
+            self.frame = Frame(initial.positions, self._eye, self._eye)
 
         def step(self, force=None, *, held=None):
             x, before = self.state.positions, self.state.previous
@@ -113,7 +113,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
             new = 2 * (x + shift) - before
             new = torch.where(held[:, None], x, new) if held is not None else new
             self.state = SimState(new, x)
-            self.frame = SteppedFrame(new, self._eye, self._eye)
+            self.frame = Frame(new, self._eye, self._eye)
             return self.frame
 
         def settle(self) -> None: ...

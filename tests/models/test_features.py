@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -9,11 +10,18 @@ import torch
 from helpers.bodies import make_model, make_scene, make_state
 
 from gausim.core import SimState
-from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, UnitState, edge_features, network_inputs
+from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, edge_features, network_inputs
 from gausim.models.step.recursion import Solved, Units
 
 DT = 0.25
 PAPER = FeatureOptions(rest_inputs=False, velocities=True, centred=False, floor=False)
+
+
+class UnitState(NamedTuple):
+    rest: torch.Tensor
+    now: torch.Tensor
+    before: torch.Tensor
+    after: torch.Tensor
 
 
 def _unit_state(seed: int, count: int = 4) -> UnitState:
@@ -73,7 +81,7 @@ def test_edge_features_by_hand(coarse: bool) -> None:
     edge_index = torch.tensor([[1, 2, 0, 3], [0, 0, 1, 2]])
     options = replace(PAPER, rest_inputs=True)
     dt = torch.full((4, 1), DT, dtype=torch.float64)
-    out = edge_features(unit, centre, edge_index, dt, options, coarse=coarse)
+    out = edge_features(torch.stack(unit), torch.stack(centre), edge_index, dt, options, coarse=coarse)
     current, about = (unit.after, centre.after) if coarse else (unit.now, centre.now)
     for e, (s, d) in enumerate(edge_index.T.tolist()):
         x, c = current.numpy(), about.numpy()[d]
@@ -96,8 +104,8 @@ def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(dtype: 
     unit, about = rest.clone().requires_grad_(), centre.clone().requires_grad_()
     edge_index = torch.tensor([[1, 0, 3, 2, 2, 3], [0, 1, 2, 3, 0, 0]])
     out = edge_features(
-        UnitState(rest, unit, unit, unit),
-        UnitState(centre, about, about, about),
+        torch.stack((rest, unit, unit, unit)),
+        torch.stack((centre, about, about, about)),
         edge_index,
         torch.full((4, 1), DT, dtype=dtype),
         PAPER,

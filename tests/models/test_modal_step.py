@@ -39,7 +39,9 @@ def test_the_step_solves_its_equation(body: partial) -> None:
 @BODIES
 @torch.no_grad()
 def test_resistance_to_growth_takes_the_energy_that_is_lost_and_none_from_a_rotation(body: partial) -> None:
-    part = neural_model(template=partial(body, solid=SolidSettings(0.12, 0.0), links=Links(12, damping=0.1), hidden=48)).modal_scene(0)
+    part = neural_model(
+        template=partial(body, solid=SolidSettings(0.12, 0.0), links=Links(12, damping=0.1), hidden=48)
+    ).modal_scene(0)
     part.corrections = 30  # the usual ones leave more unsolved than growth takes
     part.damping = torch.zeros_like(part.damping)
     before, now = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -61,7 +63,11 @@ def test_resistance_to_growth_takes_the_energy_that_is_lost_and_none_from_a_rota
 @torch.no_grad()
 def test_a_step_keeps_energy_where_springs_are_far_stiffer_than_inertia() -> None:
     """A swing that turns springs by a tenth in a frame, the stiffest of them at 28 radians per frame."""
-    part = neural_model(template=partial(MaterialTemplate, modes=24, solid=SolidSettings(0.2, 0.0), links=Links(8, damping=0.0), law="springs")).modal_scene(0)
+    part = neural_model(
+        template=partial(
+            MaterialTemplate, modes=24, solid=SolidSettings(0.2, 0.0), links=Links(8, damping=0.0), law="springs"
+        )
+    ).modal_scene(0)
     springs, times = part.nonlinear, 1.5
     along = (springs.offset[..., None] * springs.modes.unflatten(0, (-1, 3))).sum(1) / springs.length[:, None]
     part.stiffness = part.stiffness + along.mT @ (((times - 1) * part.factor * springs.stiffness)[:, None] * along)

@@ -139,7 +139,7 @@ def test_units_see_how_near_the_floor_is_and_where(monkeypatch: pytest.MonkeyPat
     middle = scene.means.mean(0)
     turned = (scene.means - middle) @ turn.mT + middle
     model.step(batch, SimState(turned, turned), prepared=prepared)
-    height = FLOOR.height(prepared.aggregate(turned)) / model.hierarchies[0].diagonal
+    height = FLOOR.height(prepared.mean(turned)) / model.hierarchies[0].diagonal
     near = prepared.per_level((1 - height[:, None] / 0.2).clamp(0, 1).square())
     assert float(near[-1].max()) > 0.1 and float(near[-1].min()) == 0
     normal = torch.from_numpy(model.body_axes[0]) @ turn.mT @ torch.tensor(FLOOR.normal).double()

@@ -13,11 +13,10 @@ from helpers import sway, toy_object
 from helpers.simulators import gausim
 from torch import Tensor
 
-from gausim.core import ConfigError, GaussianScene, HandPath, SmoothMotions
+from gausim.core import ConfigError, Frame, GaussianScene, HandPath, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.losses import ImageLoss
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.reference.reference import Placed
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops.deformation import polar_rotation
@@ -25,6 +24,7 @@ from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
+from gausim.training.rollout import States
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.motion_tracks import MotionTracker, TrackSupervision
 from gausim.training.supervision.points import PointSupervision
@@ -60,12 +60,12 @@ def coordinates() -> Tensor:
 def filmed(model: GausSim, coordinates: Tensor) -> SequenceSample:
     motions = model.smooth_motions(0)
     assert motions is not None
-    return _film(_state(motions, coordinates)[:3], motions.unit_of_kernel)
+    return _film(_state(motions, coordinates), motions.unit_of_kernel)
 
 
-def _state(motions: SmoothMotions, coordinates: Tensor) -> Placed:
+def _state(motions: SmoothMotions, coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     deformations = motions.deformations(coordinates)
-    return Placed(SCENE.means + motions.displacements(coordinates), deformations, polar_rotation(deformations))
+    return SCENE.means + motions.displacements(coordinates), deformations, polar_rotation(deformations)
 
 
 def _film(state: Sequence[Tensor], unit_of_kernel: Tensor) -> SequenceSample:
@@ -99,9 +99,9 @@ def test_motion_about_moving_hands_is_found_in_the_images(sources: Sources, coor
     motions = model.smooth_motions(0)
     assert motions is not None and references is not None
     made = _state(motions, 0.5 * coordinates)
-    rows = [Placed(*(x[f] for x in made[:3])) for f in range(FRAMES)]
+    rows = [Frame(*own) for own in zip(*made, strict=True)]
     placed = [rows[0], *(carried.place(row) for (carried, _), row in zip(references, rows[1:], strict=True))]
-    state = [torch.stack(x) for x in zip(*(row[:3] for row in placed), strict=True)]
+    state = States.of(placed)
     moved = (state[0][-1] - SCENE.means)[SCENE.pinned]
     torch.testing.assert_close(moved, way[-1].expand_as(moved))
     filmed = _film(state, motions.unit_of_kernel)

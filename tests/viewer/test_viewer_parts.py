@@ -18,7 +18,7 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 import msgspec
 import zstandard
 
-from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
+from gausim.core import DataError, DivergenceError, Frame, GaussianScene, Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.models.template.template import Property
 from gausim.ops.covariance import covariance_from_scales
@@ -117,7 +117,7 @@ def test_strain_is_the_largest_logarithm_of_a_stretch(painter: tuple[Painter, In
     deformation_gradients = interaction.frame.deformation_gradients.clone()
     unit = int(interaction.unit_of_kernel[interaction.scene.simulated & ~interaction.scene.pinned][0])
     deformation_gradients[unit] = torch.diag(torch.tensor([1.0, 0.5, 1.5]))
-    frame = SteppedFrame(interaction.frame.positions, deformation_gradients, interaction.frame.rotations)
+    frame = Frame(interaction.frame.positions, deformation_gradients, interaction.frame.rotations)
     still = torch.zeros(interaction.scene.count)
     _, rgb, legend = paint(frame, interaction.unit_of_kernel, still, STRAIN, torch.ones(3))
     assert legend.high == pytest.approx(np.log(2.0), rel=1e-5)

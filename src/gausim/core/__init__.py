@@ -22,12 +22,12 @@ if TYPE_CHECKING:
         Adjustable,
         Dynamics,
         Forces,
+        Frame,
         Handled,
         Hands,
         Rendered,
         Renderer,
         Steppable,
-        SteppedFrame,
         Stepper,
         roll_out,
         trajectory_of,
@@ -40,7 +40,7 @@ __all__ = [
     "Adjustable", "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
     "FittedDynamics", "FittedMethod", "FittedState", "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
     "HandPose", "Handled", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions",
-    "Steppable", "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
+    "Steppable", "Frame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
 ]  # fmt: skip
 
 _LATE = ("camera", "fitted", "protocols", "scene", "state", "surroundings")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gausim.core.errors import ConfigError, DivergenceError
-from gausim.core.protocols import Forces, SteppedFrame, roll_out
+from gausim.core.protocols import Forces, Frame, roll_out
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
 
@@ -122,11 +122,11 @@ class FittedStepper:
         free = method.scenes[self._scene_id].surroundings.free
         positions = self._inner.positions if free else initial.positions.to(self._inner.positions)
         self.state = SimState(positions, positions)
-        self.frame = SteppedFrame(positions, self._inner.deformation_gradients, self._inner.rotations)
+        self.frame = Frame(positions, self._inner.deformation_gradients, self._inner.rotations)
         self.unit_of_kernel: Int[Tensor, " K"] = method.unit_of_kernel(self._scene_id)
         self.fps: float = method.fps[self._scene_id]
 
-    def step(self, force: Tensor | None = None, *, held: Tensor | None = None) -> SteppedFrame:
+    def step(self, force: Tensor | None = None, *, held: Tensor | None = None) -> Frame:
         """The next frame.
 
         Raises:
@@ -142,7 +142,7 @@ class FittedStepper:
                 f"frame {made.frame}. Fit it again with smaller rates (model.plan.stages.STAGE.rates)."
             )
         self.state = SimState(made.positions, self.state.positions)
-        self.frame = SteppedFrame(made.positions, made.deformation_gradients, made.rotations)
+        self.frame = Frame(made.positions, made.deformation_gradients, made.rotations)
         return self.frame
 
     def settle(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -29,12 +29,21 @@ class Dynamics(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class SteppedFrame:
-    """One frame of a :class:`gausim.core.Trajectory`."""
+class Frame:
+    """One predicted frame of a scene or of a batch."""
 
     positions: Float[Tensor, "K 3"]  # kernel means [scene units]
     deformation_gradients: Float[Tensor, "N 3 3"]  # accumulated deformation gradients of the N units that carry kernels
     rotations: Float[Tensor, "N 3 3"]  # rotations of these units
+    # where the next step starts, if it is more than the last two positions: an impact changed a velocity, for instance
+    state: SimState | None = None
+    # the momentum loss of the step, summed over the members of a batch; zero where it is switched off
+    momentum: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
+    predicted: tuple[Tensor, ...] = ()  # the network's F (N, 3, 3) per predicted level, coarse to fine
+
+    def following(self, state: SimState) -> SimState:
+        """The state after this frame, which was predicted from ``state``."""
+        return SimState(self.positions, state.positions) if self.state is None else self.state
 
 
 @runtime_checkable
@@ -46,7 +55,7 @@ class Stepper(Protocol):
         """The two latest positions of all kernels."""
 
     @property
-    def frame(self) -> SteppedFrame:
+    def frame(self) -> Frame:
         """The latest frame; before the first step the initial one."""
 
     @property
@@ -65,9 +74,7 @@ class Stepper(Protocol):
     def limited(self) -> int:
         """Frames so far whose forces or motion were reduced to stay within the learned range."""
 
-    def step(
-        self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
-    ) -> SteppedFrame:
+    def step(self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None) -> Frame:
         """The next frame.
 
         Args:
@@ -118,7 +125,7 @@ def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Traj
     return trajectory_of(frames, stepper)
 
 
-def trajectory_of(frames: Sequence[SteppedFrame], stepper: Stepper) -> Trajectory:
+def trajectory_of(frames: Sequence[Frame], stepper: Stepper) -> Trajectory:
     """Joins frames of a stepper to one trajectory."""
     return Trajectory(
         torch.stack([f.positions for f in frames]),

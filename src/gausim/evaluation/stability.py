@@ -61,7 +61,7 @@ class _LinearStep:
             shifts = batch.rest.new_zeros(2, len(free), 3, requires_grad=True)
             kernels = (shifts * free[:, None]).index_select(1, batch.finest)
             state = SimState(batch.rest + kernels[0], batch.rest + kernels[1])
-            after = prepared.aggregate(model.step(batch, state, prepared=prepared).positions)
+            after = prepared.mean(model.step(batch, state, prepared=prepared).positions)
             (pulled,) = torch.autograd.grad((after[free] * weights.view(-1, 3)).sum(), shifts)
         rows = pulled[:, free].view(2, len(weights), self.count)
         return torch.cat((rows[0], rows[1]), 1).double().cpu().numpy()

@@ -16,12 +16,12 @@ from gausim.core import (
     Adjustable,
     ConfigError,
     DivergenceError,
+    Frame,
     GaussianScene,
     Handled,
     Hands,
     SimState,
     Steppable,
-    SteppedFrame,
     Trajectory,
     trajectory_of,
 )
@@ -115,7 +115,7 @@ class Interaction:
         self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
         self._diagonal = scene.diagonal
         self._exposure = exposure(scene, self.masses, self._free)
-        self._frames: deque[SteppedFrame] = deque(maxlen=keep)
+        self._frames: deque[Frame] = deque(maxlen=keep)
         self.restart()
 
     def restart(self) -> None:
@@ -141,7 +141,7 @@ class Interaction:
             self._stepper = self._dynamics.stepper(self._initial, self._hands.pose)
         else:
             self._stepper = self._dynamics.stepper(self._initial)
-        self.frame: SteppedFrame = self._stepper.frame
+        self.frame: Frame = self._stepper.frame
         self.frame_number = 0
         self.broken: str | None = None
         self.held: Bool[Tensor, " K"] = torch.zeros_like(self._free)
@@ -150,7 +150,7 @@ class Interaction:
         self._steady: Gravity | None = None
         self._wind: Wind | None = None
 
-    def step(self) -> SteppedFrame:
+    def step(self) -> Frame:
         """The next frame.
 
         Raises:
@@ -218,7 +218,7 @@ class Interaction:
         found = [0.0] * 6 if self._hands is None else self._hands.places(self.frame_number)[number].tolist()
         return tuple(found[:3]), tuple(found[3:])
 
-    def trajectory(self, frames: Sequence[SteppedFrame] | None = None) -> Trajectory:
+    def trajectory(self, frames: Sequence[Frame] | None = None) -> Trajectory:
         """The given frames of this session; by default the kept ones, from the initial or from the oldest kept."""
         return trajectory_of(frames or self._frames or [self.frame], self._stepper)
 
@@ -361,7 +361,7 @@ class Interaction:
         waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
         return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
 
-    def _check(self, frame: SteppedFrame) -> None:
+    def _check(self, frame: Frame) -> None:
         number = self.frame_number + 1
         away = (frame.positions - self._rest).norm(dim=-1) / self._diagonal
         gone = ~(away <= FARTHEST)  # also NaN

@@ -183,4 +183,3 @@ class ModalInitialStates(InitialStates):
         """Displacement of x_{-1} when v_0 changes by ``change``, smallest over the scenes [diagonals]."""
         moved = [float(basis[..., 0].norm(dim=1).max()) for basis in self._basis]
         return change * min(most / diagonal for most, diagonal in zip(moved, self._diagonal, strict=True))
-

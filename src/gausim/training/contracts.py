@@ -23,16 +23,6 @@ class SceneBatch(Protocol):
 
 
 @runtime_checkable
-class Step(Protocol):
-    """One predicted frame of a batch."""
-
-    positions: Tensor  # (K over all members, 3) kernel means [scene units]
-    deformation_gradients: Tensor  # (N over all members, 3, 3) accumulated deformation gradients of the units
-    rotations: Tensor  # (N over all members, 3, 3) accumulated rotations of the units
-    momentum: Tensor  # the momentum loss, summed over members; zero where it is switched off
-
-
-@runtime_checkable
 class Simulator(Protocol):
     """Dynamics of a batch of sequences, as a torch module.
 

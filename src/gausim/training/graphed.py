@@ -9,12 +9,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from gausim.core import SimState
+from gausim.core import Frame, SimState
 from gausim.models.rollout.cuda_graph import not_captured
 from gausim.models.step.simulator import GausSim
 from gausim.training.contracts import SceneBatch
-from gausim.training.contracts import Step as PredictedStep
-from gausim.training.rollout import Frame, States, after, windows
+from gausim.training.rollout import States, after, windows
 
 # Frames of a rollout, tensor by tensor, from its two initial positions.
 Replay = Callable[..., tuple[Tensor, ...]]
@@ -59,7 +58,7 @@ class GraphedRollouts:
 
     def windows(
         self, batch: SceneBatch, initial: SimState, steps: int, length: int, *, isolated: bool = False
-    ) -> Iterator[tuple[int, list[PredictedStep]]]:
+    ) -> Iterator[tuple[int, list[Frame]]]:
         """As :func:`gausim.training.rollout.windows`, by replays where they serve.
 
         Raises:
@@ -75,7 +74,7 @@ class GraphedRollouts:
             state = after(made, state)
             yield start, made
 
-    def _replayed(self, batch: SceneBatch, initial: SimState, steps: int, isolated: bool) -> list[PredictedStep]:
+    def _replayed(self, batch: SceneBatch, initial: SimState, steps: int, isolated: bool) -> list[Frame]:
         given, parameters = (initial.positions, initial.previous), list(self._model.parameters())
         kind, trained = (len(batch.members), isolated), tuple(x.requires_grad for x in (*given, *parameters))
         if self._kept.get(kind, ((), None))[0] != (steps, trained):
@@ -86,7 +85,7 @@ class GraphedRollouts:
             if parameter.requires_grad and parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
         made = [x.clone() for x in self._kept[kind][1](*given)]  # the next replay overwrites what the capture returns
-        return [Frame(*own) for own in zip(*made, strict=True)]
+        return [Frame(x, gradients, q, momentum=m) for x, gradients, q, m in zip(*made, strict=True)]
 
     def _capture(self, stretch: _Stretch, initial: SimState) -> Replay:
         given = tuple(x.detach().clone().requires_grad_(x.requires_grad) for x in (initial.positions, initial.previous))

@@ -14,7 +14,8 @@ from torch.optim import Optimizer
 from gausim.core import ConfigError, HandPath, Hands, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
-from gausim.models.reference.reference import Carried, UnitMotion, hand_motion
+from gausim.models.hierarchy.units import UnitMotion
+from gausim.models.reference.reference import Carried, hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.training.contracts import Simulator
 from gausim.training.optimizers import OptimizerSettings, set_rates
@@ -197,7 +198,7 @@ class SharedSimulator(Method):
             return None
         batch = self._simulator.batch([self.scene_of_sequence[sequence_id]])
         prepared, rest = self._simulator.prepare(batch), SimState(batch.rest, batch.rest)
-        return [prepared.carried(rest, [hand_motion(hands, frame)]) for frame in range(steps)]
+        return [prepared.aggregate(rest, [hand_motion(hands, frame)]) for frame in range(steps)]
 
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a training sequence from its initial state, for all kernels of its scene."""

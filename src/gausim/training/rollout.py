@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -14,24 +13,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
-from gausim.core import DivergenceError, Hands, SimState
+from gausim.core import DivergenceError, Frame, Hands, SimState
 from gausim.data.dataset import SampleFacts
 from gausim.models.reference.reference import hand_motion
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.training.contracts import SceneBatch, Simulator
-from gausim.training.contracts import Step as PredictedStep
 from gausim.training.ranks.ranks import Ranks, interleave
-
-
-@dataclass(eq=False)
-class Frame:
-    """One predicted frame (see :class:`gausim.training.contracts.Step`), and a state that is more than positions."""
-
-    positions: Tensor
-    deformation_gradients: Tensor
-    rotations: Tensor
-    momentum: Tensor
-    state: SimState | None = None
 
 
 def checkpointed_step(
@@ -53,18 +40,18 @@ def checkpointed_step(
     # A step draws no random numbers, so no generator needs to be restored.
     made = torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False)
     positions, deformation_gradients, rotations, momentum, last = made
-    return Frame(positions, deformation_gradients, rotations, momentum, SimState(positions, last))
+    return Frame(positions, deformation_gradients, rotations, SimState(positions, last), momentum)
 
 
 class States(NamedTuple):
-    """T predicted frames of all members of a batch (see :class:`gausim.training.contracts.Step`)."""
+    """T predicted frames of all members of a batch (see :class:`gausim.core.Frame`)."""
 
     positions: Float[Tensor, "T K 3"]
     deformation_gradients: Float[Tensor, "T N 3 3"]
     rotations: Float[Tensor, "T N 3 3"]
 
     @staticmethod
-    def of(steps: Sequence[PredictedStep]) -> States:
+    def of(steps: Sequence[Frame]) -> States:
         """Stacks the steps of a stretch."""
         return States(*(torch.stack([getattr(step, name) for step in steps]) for name in States._fields))
 
@@ -80,7 +67,7 @@ def windows(
     checkpoint: bool = False,
     hands: Sequence[Hands | None] | None = None,
     isolated: bool = False,
-) -> Iterator[tuple[int, list[PredictedStep]]]:
+) -> Iterator[tuple[int, list[Frame]]]:
     """Predicts ``steps`` frames of a batch in stretches of ``length`` frames.
 
     Loss gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from
@@ -95,7 +82,7 @@ def windows(
     for start in range(0, steps, length):
         state = state.detach() if start else state
         state = state if restart is None else restart(state)
-        made: list[PredictedStep] = []
+        made: list[Frame] = []
         prepared = None if checkpoint else model.prepare(batch, **({"isolated": True} if isolated else {}))
         for number in range(start, start + min(length, steps - start)):
             moved: dict[str, Any] = {}
@@ -106,20 +93,14 @@ def windows(
                 if checkpoint
                 else model.step(batch, state, prepared=prepared, **moved)
             )
-            state = _following(made[-1], state)
+            state = made[-1].following(state)
         yield start, made
 
 
-def _following(step: PredictedStep, state: SimState) -> SimState:
-    """The state after a step: ``step.state`` where a model's state is more than positions."""
-    own: SimState | None = getattr(step, "state", None)
-    return SimState(step.positions, state.positions) if own is None else own
-
-
-def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
+def after(steps: Sequence[Frame], state: SimState) -> SimState:
     """The state after a stretch that began at ``state``, detached."""
     for step in steps:
-        state = _following(step, state)
+        state = step.following(state)
     return state.detach()
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import GaussianScene, SteppedFrame
+from gausim.core import Frame, GaussianScene
 from gausim.models.template.template import Property
 from gausim.ops.covariance import transport_covariance
 from gausim.ops.spherical_harmonics import C0
@@ -64,7 +64,7 @@ class Painter:
 
     def __call__(
         self,
-        frame: SteppedFrame,
+        frame: Frame,
         unit_of_kernel: Int[Tensor, " K"],
         speed: Float[Tensor, " K"],
         mode: str,

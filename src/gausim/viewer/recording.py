@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gausim.core import DataError, GaussianScene, SteppedFrame, Trajectory
+from gausim.core import DataError, Frame, GaussianScene, Trajectory
 from gausim.io.files import write_durably
 from gausim.io.motion import check_trajectory
 from gausim.viewer.access import Access
@@ -59,7 +59,7 @@ def _recorded(server: GuardedServer, scene: GaussianScene, trajectory: Trajector
     still, eye = torch.zeros(scene.count), torch.zeros(3)  # base colours depend on neither
 
     def buffer(number: int) -> np.ndarray:
-        frame = SteppedFrame(
+        frame = Frame(
             trajectory.positions[number].float(), trajectory.deformation_gradients[number].float(),
             trajectory.rotations[number].float(),
         )  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import DivergenceError, SteppedFrame, Trajectory
+from gausim.core import DivergenceError, Frame, Trajectory
 from gausim.interaction.interaction import Interaction
 
 # Name of the interactive source; the others are recordings.
@@ -20,7 +20,7 @@ LIVE = "Live simulation"
 class Shown:
     """A frame with the data for its display."""
 
-    frame: SteppedFrame
+    frame: Frame
     unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel, a row of the frame's deformation gradients
     speed: Float[Tensor, " K"]  # speeds of the kernels [scene units / s]
     held: Bool[Tensor, " K"] | None = None  # mask of the kernels pinned by events; None without any
@@ -53,7 +53,7 @@ def shown_frame(trajectory: Trajectory, number: int, name: str, beside: Shown | 
     Raises:
         DivergenceError: a position of the frame is not finite.
     """
-    frame = SteppedFrame(
+    frame = Frame(
         trajectory.positions[number], trajectory.deformation_gradients[number], trajectory.rotations[number]
     )  # fmt: skip
     if not bool(torch.isfinite(frame.positions).all()):

@@ -98,7 +98,9 @@ def fixed_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
     E does not depend on the positions, and the host is not synchronised.
     """
     codes = neighbour_codes(positions, level.member, level.device_radii, level.max_neighbours)
-    return coded_edges(combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule), level.count)
+    return coded_edges(
+        combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule), level.count
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,20 @@ from gausim.models.hierarchy.batch import SceneBatch
 
 
 @dataclass(frozen=True, eq=False)
+class UnitMotion:
+    """Finest units of a batch, of a scene or of a member at t and t - 1, relative to the reference [scene units]."""
+
+    rest: Float[Tensor, "N 3"]  # X
+    now: Float[Tensor, "N 3"]
+    before: Float[Tensor, "N 3"]
+    # in the reference's axes: acceleration [scene units / frame^2], and the reference's displacement gradient by rows;
+    # None for a reference at rest
+    load: Float[Tensor, "N 12"] | None = None
+    # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
+    floor: Float[Tensor, "N 4"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class FixedUnits:
     """Constants of the units of one level between two updates of the parameters."""
 

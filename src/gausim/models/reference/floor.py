@@ -20,14 +20,14 @@ every mode if it starts from q at t + 1 and, at t, from q - (M + K / 4)^-1 (K q 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import Floor, SimState
-from gausim.models.reference.reference import Placed, turned_units
+from gausim.core import Floor, Frame, SimState
+from gausim.models.reference.reference import turned_units
 from gausim.ops.deformation import apply
 from gausim.ops.rotation import cross_matrix, rotation_of
 
@@ -134,30 +134,32 @@ class Contact:
         return torch.cat((near, near * (centres.new_tensor(self.floor.normal) @ rotation)), 1)
 
     def resolve(
-        self, placed: Placed, state: SimState, body: Elasticity, rotation: Float[Tensor, "3 3"], centre: Tensor | None
-    ) -> Placed:
+        self, frame: Frame, state: SimState, body: Elasticity, rotation: Float[Tensor, "3 3"], centre: Tensor | None
+    ) -> Frame:
         """A predicted frame, with the impulses of the floor; no kernel is left below it.
 
         Args:
-            placed: the prediction without the floor, in scene axes.
+            frame: the prediction without the floor, in scene axes.
             state: positions at t and t - 1.
             body: how the body yields.
             rotation: from the modes' axes to scene axes.
             centre: centre of mass (3,) of a free body at t + 1; None for a held one.
         """
-        points = self._points(placed.positions, state, body)
+        points = self._points(frame.positions, state, body)
         if len(points):
-            coordinates = Coordinates.of(body, placed.positions, rotation, centre)
-            now, before = self._deviation(placed, state, coordinates, points)
-            moved, slope, turn = coordinates.applied(placed.positions, now)
+            coordinates = Coordinates.of(body, frame.positions, rotation, centre)
+            now, before = self._deviation(frame, state, coordinates, points)
+            moved, slope, turn = coordinates.applied(frame.positions, now)
             earlier, _, _ = coordinates.applied(state.positions, before)
-            deformation = turned_units(turn, placed.deformation_gradients + slope)
-            placed = Placed(moved, deformation, turned_units(turn, placed.rotations), earlier)
+            deformation = turned_units(turn, frame.deformation_gradients + slope)
+            rotations = turned_units(turn, frame.rotations)
+            frame = Frame(moved, deformation, rotations, SimState(moved, earlier))
         moving = body.unit_of_kernel < len(body.modes)
-        below = torch.where(moving, -self.floor.height(placed.positions), 0.0).clamp_min(0)[:, None]
-        lift = below * placed.positions.new_tensor(self.floor.normal)
-        previous = None if placed.previous is None else placed.previous + lift
-        return placed._replace(positions=placed.positions + lift, previous=previous)
+        below = torch.where(moving, -self.floor.height(frame.positions), 0.0).clamp_min(0)[:, None]
+        lift = below * frame.positions.new_tensor(self.floor.normal)
+        positions = frame.positions + lift
+        following = None if frame.state is None else SimState(positions, frame.state.previous + lift)
+        return replace(frame, positions=positions, state=following)
 
     def _points(self, x: Float[Tensor, "K 3"], state: SimState, body: Elasticity) -> Int[Tensor, " P"]:
         """The lowest kernel of every unit that comes near the floor; none if nothing would touch it."""
@@ -169,16 +171,16 @@ class Contact:
         return _lowest(gap, body, NEAR * size)
 
     def _deviation(
-        self, placed: Placed, state: SimState, coordinates: Coordinates, points: Int[Tensor, " P"]
+        self, frame: Frame, state: SimState, coordinates: Coordinates, points: Int[Tensor, " P"]
     ) -> tuple[Float[Tensor, " C"], Float[Tensor, " C"]]:
         """The deviation at t + 1, and at t as the next frame has to see it."""
-        axes, h = _axes(placed.positions.new_tensor(self.floor.normal)), 1.0 / SUBSTEPS
-        jacobian = coordinates.jacobian(points, placed.positions, axes)
+        axes, h = _axes(frame.positions.new_tensor(self.floor.normal)), 1.0 / SUBSTEPS
+        jacobian = coordinates.jacobian(points, frame.positions, axes)
         inertia, stiffness, damping = coordinates.inertia, coordinates.stiffness, coordinates.damping
         response = torch.linalg.inv(inertia + h**2 / 4 * stiffness + h / 2 * damping)
         spread = _softer(jacobian @ response @ jacobian.mT, COMPLIANCE)
         start, end = (
-            (x[points] - x.new_tensor(self.floor.point)) @ axes.mT for x in (state.positions, placed.positions)
+            (x[points] - x.new_tensor(self.floor.point)) @ axes.mT for x in (state.positions, frame.positions)
         )
         bent = end - 2 * start + (state.previous[points] - start.new_tensor(self.floor.point)) @ axes.mT
         paths = [start + i * h * (end - start) + 0.5 * i * h * (i * h - 1) * bent for i in range(-1, SUBSTEPS + 1)]

@@ -14,9 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import SimState
+from gausim.core import Frame, SimState
+from gausim.models.hierarchy.units import UnitMotion
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.reference import Body, Carried, HandMotion, Placed, UnitMotion, turned_units
+from gausim.models.reference.reference import Body, Carried, HandMotion, turned_units
 from gausim.ops.deformation import polar_rotation
 from gausim.ops.rotation import axial, rotation_of
 
@@ -49,7 +50,8 @@ class FreeBody(Body):
         # Far from the origin a step is small against the positions: their means are taken in double precision.
         self.fractions = mass.double() / mass.double().sum()
         self.centre = self.mass @ kernels
-        self.kernels, self.units = kernels, rest
+        super().__init__(rest)
+        self.kernels = kernels
         self.simulated = mass > 0
         offset = kernels - self.centre
         spread = offset.mT @ (self.mass[:, None] * offset)
@@ -94,22 +96,22 @@ class FreeMotion(Carried):
         present = body.centre + about(now, self.centre) @ self.turned
         past = body.centre + about(before, self.last_centre) @ last
         floor = None if body.contact is None else body.contact.nearness(now, self.turned)
-        super().__init__(UnitMotion(present, past, load, floor))
+        super().__init__(UnitMotion(body.units, present, past, load, floor))
 
-    def place(self, made: Placed) -> Placed:
+    def place(self, frame: Frame) -> Frame:
         """The predicted shape, placed so that momentum and angular momentum are kept; then the floor."""
         body = self.body
-        shape = made.positions - body.mass @ made.positions
+        shape = frame.positions - body.mass @ frame.positions
         rotation = self._rotation(shape)
         centre = 2 * self.centre - self.last_centre + body.gravity.double()
         moved = (centre + (shape @ rotation.mT).double()).to(shape)
-        positions = torch.where(body.simulated[:, None], moved, made.positions)
-        placed = Placed(
-            positions, turned_units(rotation, made.deformation_gradients), turned_units(rotation, made.rotations)
+        positions = torch.where(body.simulated[:, None], moved, frame.positions)
+        frame = Frame(
+            positions, turned_units(rotation, frame.deformation_gradients), turned_units(rotation, frame.rotations)
         )
         if body.contact is None:
-            return placed
-        return body.contact.resolve(placed, self.state, body.elasticity, rotation, centre.to(shape))
+            return frame
+        return body.contact.resolve(frame, self.state, body.elasticity, rotation, centre.to(shape))
 
     def _rotation(self, shape: Float[Tensor, "K 3"]) -> Float[Tensor, "3 3"]:
         """R with sum m r_t x R w = sum m r_{t-1} x r_t, in double precision."""

@@ -19,10 +19,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.core import GaussianScene, HandPose, SimState
+from gausim.core import Frame, GaussianScene, HandPose, SimState
 from gausim.models.hierarchy.clusters import Hierarchy
+from gausim.models.hierarchy.units import UnitMotion
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.reference import Body, Carried, HandMotion, Placed, UnitMotion
+from gausim.models.reference.reference import Body, Carried, HandMotion
 from gausim.models.template.solid import SolidSettings, static_responses
 from gausim.ops.deformation import apply, polar_rotation
 from gausim.ops.rotation import rotation_vector
@@ -126,7 +127,8 @@ class HeldBody(Body):
             contact: the floor; None: there is none.
             elasticity: how the body yields to a contact.
         """
-        self.shape, self.kernels, self.units, self.unit_of_kernel = shape, kernels, rest, elasticity.unit_of_kernel
+        super().__init__(rest)
+        self.shape, self.kernels, self.unit_of_kernel = shape, kernels, elasticity.unit_of_kernel
         self.gravity, self.contact, self.elasticity = gravity, contact, elasticity
         self.of = shape.of.to(kernels.device)
 
@@ -167,21 +169,21 @@ class HeldMotion(Carried):
         load = torch.cat((pull, slope.flatten(1)), 1)
         floor = None if body.contact is None else body.contact.nearness(now, present[1])
         shown, shown_before = body.units + (now - present[0]) @ present[1], body.units + (before - last[0]) @ last[1]
-        super().__init__(UnitMotion(shown, shown_before, load, floor))
+        super().__init__(UnitMotion(body.units, shown, shown_before, load, floor))
 
-    def place(self, made: Placed) -> Placed:
+    def place(self, frame: Frame) -> Frame:
         """The prediction about the static shape at t + 1; pinned kernels go where their hands are; then the floor."""
-        body, identity = self.body, torch.eye(3).to(made.positions)
+        body, identity = self.body, torch.eye(3).to(frame.positions)
         nowhere, axes, unit = body.units.new_zeros(1, 3), self.after[1], body.unit_of_kernel
         place, units = torch.cat((self.after[0], nowhere)), torch.cat((body.units, nowhere))
         gradient, turns = (torch.cat((x, identity[None])) for x in self.after[2:])
         static = place[unit] + apply(gradient[unit], body.kernels - units[unit])
-        positions = static + (made.positions - body.kernels) @ axes.mT
+        positions = static + (frame.positions - body.kernels) @ axes.mT
         if self.hands.after is not None:
             pose = body.shape.with_still(self.hands.after.to(positions))
             positions = torch.where((body.of < 0)[:, None], positions, pose.move(body.kernels, body.of.clamp_min(0)))
-        deformation = gradient + axes @ (made.deformation_gradients - identity)
-        placed = Placed(positions, deformation, turns @ made.rotations)
+        deformation = gradient + axes @ (frame.deformation_gradients - identity)
+        frame = Frame(positions, deformation, turns @ frame.rotations)
         if body.contact is None:
-            return placed
-        return body.contact.resolve(placed, self.state, body.elasticity, axes, None)
+            return frame
+        return body.contact.resolve(frame, self.state, body.elasticity, axes, None)

@@ -15,15 +15,16 @@ prediction y, G, Q of the kernels at t + 1 goes back to
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import HandPose, Hands, SimState
+from gausim.core import Frame, HandPose, Hands, SimState
 from gausim.models.hierarchy.batch import Member, SceneBatch
+from gausim.models.hierarchy.units import UnitMotion
 
 
 class HandMotion(NamedTuple):
@@ -39,28 +40,6 @@ def hand_motion(hands: Hands | None, frame: int) -> HandMotion | None:
     return None if hands is None else HandMotion(hands(frame - 1), hands(frame), hands(frame + 1))
 
 
-@dataclass(frozen=True, eq=False)
-class UnitMotion:
-    """Finest units of a batch or of a member, relative to the reference [scene units]."""
-
-    now: Float[Tensor, "N 3"]
-    before: Float[Tensor, "N 3"]
-    # in the reference's axes: acceleration [scene units / frame^2], and the reference's displacement gradient by rows
-    load: Float[Tensor, "N 12"] | None
-    # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
-    floor: Float[Tensor, "N 4"] | None = None
-
-
-class Placed(NamedTuple):
-    """Kernels and units of a body, in scene axes."""
-
-    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
-    deformation_gradients: Float[Tensor, "R 3 3"]  # of the units and the identity row
-    rotations: Float[Tensor, "R 3 3"]
-    # positions one frame earlier as the next step has to see them, where an impact changed the velocity
-    previous: Float[Tensor, "K 3"] | None = None
-
-
 def turned_units(rotation: Float[Tensor, "3 3"], matrices: Float[Tensor, "R 3 3"]) -> Float[Tensor, "R 3 3"]:
     """Matrices of the units after a rotation of the body; the identity row, the last, stays."""
     return torch.cat((rotation @ matrices[:-1], matrices[-1:]))
@@ -72,20 +51,24 @@ class Carried:
     def __init__(self, relative: UnitMotion) -> None:
         self.relative = relative
 
-    def place(self, made: Placed) -> Placed:
+    def place(self, frame: Frame) -> Frame:
         """The prediction relative to the reference, in the scene."""
-        return made
+        return frame
 
 
 class Body:
     """A member of a batch, constant between two updates of the parameters; in this base class its reference is at rest.
 
-    States are those of its kernels (K, 3), in scene axes.
+    States are those of its kernels (K, 3), in scene axes; ``rest`` are its units' centres of mass at rest (N, 3).
     """
+
+    def __init__(self, rest: Float[Tensor, "N 3"]) -> None:
+        """Stores the units."""
+        self.units = rest
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> Carried:
         """A step of the body from its units (N, 3) and kernels at t and t - 1."""
-        return Carried(UnitMotion(now, before, now.new_zeros(len(now), 12)))
+        return Carried(UnitMotion(self.units, now, before, now.new_zeros(len(now), 12)))
 
     def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
         """A state relative to the reference."""
@@ -101,9 +84,9 @@ class Reference:
 
     moves = False
 
-    def __init__(self, batch: SceneBatch) -> None:
-        """Stores the members and the rows of their units."""
-        self._members, self._spans, self._like = batch.members, batch.levels[-1].spans, batch.rest
+    def __init__(self, batch: SceneBatch, rest: Float[Tensor, "N 3"]) -> None:
+        """Stores the members, the rows of their units, and the units' centres of mass at ``rest``."""
+        self._members, self._spans, self._like, self.rest = batch.members, batch.levels[-1].spans, batch.rest, rest
 
     def carry(
         self,
@@ -116,7 +99,7 @@ class Reference:
 
         ``now`` and ``before`` are in scene axes; ``hands`` are those of every member.
         """
-        return Carried(UnitMotion(now, before, None))
+        return Carried(UnitMotion(self.rest, now, before))
 
     def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
         """Deformation gradients and rotations of all rows of a step where the bodies have their rest shape."""
@@ -137,9 +120,9 @@ class MovingReference(Reference):
 
     moves = True
 
-    def __init__(self, batch: SceneBatch, bodies: Sequence[Body]) -> None:
+    def __init__(self, batch: SceneBatch, rest: Float[Tensor, "N 3"], bodies: Sequence[Body]) -> None:
         """``bodies`` has one entry per member."""
-        super().__init__(batch)
+        super().__init__(batch, rest)
         self._bodies = bodies
 
     def _own(self, state: SimState) -> Iterator[SimState]:
@@ -170,11 +153,11 @@ class MovingReference(Reference):
         hands = hands or [None] * len(self._bodies)
         members = zip(self._bodies, self._spans, self._own(state), hands, strict=True)
         motions = [body.carry(now[span], before[span], own, held) for body, span, own, held in members]
-        return _CarriedBodies(self._members, motions, state)
+        return _CarriedBodies(self._members, self.rest, motions, state)
 
 
 class _CarriedBodies(Carried):
-    def __init__(self, members: Sequence[Member], motions: Sequence[Carried], state: SimState) -> None:
+    def __init__(self, members: Sequence[Member], rest: Tensor, motions: Sequence[Carried], state: SimState) -> None:
         self._members, self._motions, self._state = members, motions, state
         parts = [motion.relative for motion in motions]
         load = torch.cat([part.load for part in parts if part.load is not None])
@@ -182,19 +165,20 @@ class _CarriedBodies(Carried):
         if any(part.floor is not None for part in parts):
             floor = torch.cat([p.now.new_zeros(len(p.now), 4) if p.floor is None else p.floor for p in parts])
         now, before = torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts])
-        super().__init__(UnitMotion(now, before, load, floor))
+        super().__init__(UnitMotion(rest, now, before, load, floor))
 
-    def place(self, made: Placed) -> Placed:
-        placed = []
+    def place(self, frame: Frame) -> Frame:
+        parts = []
         for member, motion in zip(self._members, self._motions, strict=True):
-            rows = made.deformation_gradients[member.units], made.rotations[member.units]
-            placed.append(motion.place(Placed(made.positions[member.kernels], *rows)))
-        positions = torch.cat([own.positions for own in placed])
-        deformation = torch.cat([own.deformation_gradients for own in placed])
-        rotations = torch.cat([own.rotations for own in placed])
-        previous = None
-        if any(own.previous is not None for own in placed):
+            rows = frame.deformation_gradients[member.units], frame.rotations[member.units]
+            parts.append(motion.place(Frame(frame.positions[member.kernels], *rows)))
+        positions, deformation, rotations = (
+            torch.cat([getattr(part, name) for part in parts])
+            for name in ("positions", "deformation_gradients", "rotations")
+        )
+        state = None
+        if any(part.state is not None for part in parts):
             now = [self._state.positions[member.kernels] for member in self._members]
-            before = [own.previous for own in placed]
-            previous = torch.cat([a if b is None else b for a, b in zip(now, before, strict=True)])
-        return Placed(positions, deformation, rotations, previous)
+            before = [a if part.state is None else part.state.previous for a, part in zip(now, parts, strict=True)]
+            state = SimState(positions, torch.cat(before))
+        return replace(frame, positions=positions, deformation_gradients=deformation, rotations=rotations, state=state)

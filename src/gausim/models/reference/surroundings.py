@@ -74,7 +74,7 @@ def reference_of(
     mass: Float[Tensor, " M"],
     units: FixedUnits,
     template: PreparedTemplate,
-    axes: Float[Tensor, "N 3 3"] | None,
+    axes: Float[Tensor, "N 3 3"],
     *,
     driven: bool = False,
 ) -> Reference:
@@ -86,24 +86,23 @@ def reference_of(
         mass: masses of the simulated kernels.
         units: constants of the finest predicted level, in scene axes.
         template: of the batch, which yields to contacts.
-        axes: axes of the template's modes, as rows, per unit; None: scene axes.
+        axes: axes of the template's modes, as rows, per unit.
         driven: let the pins of every scene move; those without recorded hands are one hand.
     """
     known = [cast(SceneSurroundings, surroundings[i]) for i in batch.scene_ids]
     if not driven and not any(own.moves for own in known):
-        return Reference(batch)
+        return Reference(batch, units.rest)
     masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
     bodies: list[Body] = []
     for number, (member, span, own) in enumerate(zip(batch.members, batch.levels[-1].spans, known, strict=True)):
         if not (driven or own.moves):
-            bodies.append(Body())
+            bodies.append(Body(units.rest[span]))
             continue
         rest, kernels = units.rest[span], batch.rest[member.kernels]
         contact, gravity = own.contact(rest), own.acceleration(float(batch.levels[-1].dt[span.start]), rest)
         modes, slopes, matrices, whole = template.yielding(number)
-        if axes is not None:  # to scene axes
-            turn = axes[span]
-            modes, slopes = turn.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", turn, slopes, turn)
+        turn = axes[span]  # to scene axes
+        modes, slopes = turn.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", turn, slopes, turn)
         unit = member.unit_of_kernel
         offset = kernels - torch.cat((rest, rest.new_zeros(1, 3)))[unit]
         fraction = masses[member.kernels] / masses[member.kernels].sum()
@@ -112,4 +111,4 @@ def reference_of(
             bodies.append(FreeBody(kernels, rest, masses[member.kernels], gravity, contact, elasticity))
         else:
             bodies.append(HeldBody(own.shape, kernels, rest, gravity, contact, elasticity))
-    return MovingReference(batch, bodies)
+    return MovingReference(batch, units.rest, bodies)

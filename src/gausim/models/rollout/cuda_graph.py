@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError, SimState, SteppedFrame
+from gausim.core import ConfigError, Frame, SimState
 
 WARM_UP = 3  # steps before a capture: lazy initialisation and autotuning must be over (PyTorch's notes on CUDA graphs)
 
 
-StepFunction = Callable[[SimState, Tensor | None], SteppedFrame]
+StepFunction = Callable[[SimState, Tensor | None], Frame]
 
 
 def not_captured(what: str, error: RuntimeError) -> ConfigError:
@@ -44,10 +44,10 @@ class GraphedStep:
         self._step = step
         self._state = SimState(torch.zeros_like(rest), torch.zeros_like(rest))
         self._force = torch.zeros_like(rest)
-        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, SteppedFrame]] = {}
+        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, Frame]] = {}
 
     @torch.no_grad()
-    def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> SteppedFrame:
+    def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> Frame:
         """The next frame, in newly allocated tensors.
 
         Raises:
@@ -62,9 +62,9 @@ class GraphedStep:
             self._graphs[pushed] = self._record(pushed)
         graph, made = self._graphs[pushed]
         graph.replay()
-        return SteppedFrame(made.positions.clone(), made.deformation_gradients.clone(), made.rotations.clone())
+        return Frame(made.positions.clone(), made.deformation_gradients.clone(), made.rotations.clone())
 
-    def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, SteppedFrame]:
+    def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, Frame]:
         force = self._force if pushed else None
         device = self._force.device
         aside = torch.cuda.Stream(device)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import DivergenceError, Forces, Hands, SimState, SteppedFrame, Trajectory, roll_out
+from gausim.core import DivergenceError, Forces, Frame, Hands, SimState, Trajectory, roll_out
 from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.cuda_graph import GraphedStep
 from gausim.models.rollout.energy_guard import EnergyGuard
@@ -119,10 +119,10 @@ class SceneStepper:
         self._model, self._name = model, model.scenes[scene_id].name
         self.fps: float = model.fps[scene_id]
         self._hands, self._number = hands, 0
-        self.state, self.frame = initial, SteppedFrame(initial.positions, *prepared.reference.undeformed(initial))
+        self.state, self.frame = initial, Frame(initial.positions, *prepared.reference.undeformed(initial))
         self.unit_of_kernel: Int[Tensor, " K"] = member.unit_of_kernel
 
-        def step(state: SimState, force: Tensor | None) -> SteppedFrame:
+        def step(state: SimState, force: Tensor | None) -> Frame:
             return model.step(batch, state, force, prepared, hands=[hand_motion(self._hands, self._number)])
 
         graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves
@@ -143,9 +143,7 @@ class SceneStepper:
         return 0 if self._guard is None else self._guard.limited
 
     @torch.no_grad()
-    def step(
-        self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
-    ) -> SteppedFrame:
+    def step(self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None) -> Frame:
         """The next frame; kernels in ``held`` keep their position, while their unit deforms as predicted.
 
         Raises:
@@ -162,9 +160,8 @@ class SceneStepper:
             positions = torch.where(held[:, None], self.state.positions, positions)
         self._number += 1
         self._note(0, positions)
-        after = getattr(made, "state", None)
-        self.state = SimState(positions, self.state.positions if after is None else after.previous)
-        self.frame = SteppedFrame(positions, made.deformation_gradients, made.rotations)
+        self.state = SimState(positions, made.following(self.state).previous)
+        self.frame = Frame(positions, made.deformation_gradients, made.rotations)
         return self.frame
 
     def settle(self) -> None:

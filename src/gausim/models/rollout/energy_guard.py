@@ -7,7 +7,7 @@ from collections import deque
 import torch
 from torch import Tensor
 
-from gausim.core import SimState, SteppedFrame
+from gausim.core import Frame, SimState
 from gausim.models.rollout.cuda_graph import StepFunction
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
@@ -51,10 +51,10 @@ class EnergyGuard:
         self._model, self._prepared, self._step = model, prepared, step
         self._last: deque[float] = deque(maxlen=model.rollout.energy_guard_frames)
         self._ceiling = ceiling
-        self._made: SteppedFrame | None = None
+        self._last_frame: Frame | None = None
         self.held, self.limited = 0, 0
 
-    def step(self, state: SimState, force: Tensor | None) -> SteppedFrame:
+    def step(self, state: SimState, force: Tensor | None) -> Frame:
         """The next frame; the work done by a force raises the limit.
 
         :attr:`held` counts the frames whose correction was scaled down, :attr:`limited` those whose force or step the
@@ -67,7 +67,7 @@ class EnergyGuard:
             work = max(0.0, self._energy(pushed) - self._energy(state))
             self._last = deque((energy + work for energy in self._last), self._last.maxlen)
         result = self._step(state, force)
-        energy, limit = self._energy(_after(result, state)), max(self._last)
+        energy, limit = self._energy(result.following(state)), max(self._last)
         if energy > limit:
             result, energy = self._held_back(state, force, energy, limit)
         if self._ceiling is not None and energy > self._ceiling:
@@ -76,13 +76,13 @@ class EnergyGuard:
                 result, energy = self._weakened(state, force, self._ceiling)
             if energy > self._ceiling:
                 result, energy = self._cut_short(result, state, self._ceiling)
-        lost = float(self._model.dissipated(self._prepared, _after(result, state), state.previous))
+        lost = float(self._model.dissipated(self._prepared, result.following(state), state.previous))
         self._last = deque((before - lost for before in self._last), self._last.maxlen)
         self._last.append(energy)
-        self._made = SteppedFrame(result.positions, result.deformation_gradients, result.rotations)
+        self._last_frame = result
         return result
 
-    def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[SteppedFrame, float]:
+    def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Frame, float]:
         """The template's step with the largest tried fraction of the force below the ceiling, or without the force."""
         for scale in WEAKER:
             made, energy = self._corrected(state, scale * force if scale else None, 0.0)
@@ -90,7 +90,7 @@ class EnergyGuard:
                 break
         return made, energy
 
-    def _cut_short(self, made: SteppedFrame, state: SimState, ceiling: float) -> tuple[SteppedFrame, float]:
+    def _cut_short(self, made: Frame, state: SimState, ceiling: float) -> tuple[Frame, float]:
         """The longest fraction of a step below the ceiling (at least the energy of standing still), by bisection.
 
         Both E in motion and E at rest at the end must stay below: E is evaluated at the midpoint of a step, and the
@@ -104,21 +104,19 @@ class EnergyGuard:
             needed = max(self._energy(SimState(x, state.positions)), self._energy(SimState(x, x)))
             low, high = (scale, high) if needed <= limit else (low, scale)
         part = self._part(made, state, low)
-        return part, self._energy(_after(part, state))
+        return part, self._energy(part.following(state))
 
-    def _part(self, made: SteppedFrame, state: SimState, scale: float) -> SteppedFrame:
+    def _part(self, made: Frame, state: SimState, scale: float) -> Frame:
         positions = state.positions + scale * (made.positions - state.positions)
-        if self._made is None:  # the first step: from G = I
+        if self._last_frame is None:  # the first step: from G = I
             before = turned = torch.eye(3).to(positions).expand_as(made.deformation_gradients)
         else:
-            before, turned = self._made.deformation_gradients, self._made.rotations
+            before, turned = self._last_frame.deformation_gradients, self._last_frame.rotations
         deformation_gradients = before + scale * (made.deformation_gradients - before)
         rotations = polar_rotation(turned + scale * (made.rotations - turned))
-        return SteppedFrame(positions, deformation_gradients, rotations)
+        return Frame(positions, deformation_gradients, rotations)
 
-    def _held_back(
-        self, state: SimState, force: Tensor | None, energy: float, limit: float
-    ) -> tuple[SteppedFrame, float]:
+    def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Frame, float]:
         self.held += 1
         alone, lowest = self._corrected(state, force, 0.0)
         if lowest >= limit:
@@ -126,13 +124,9 @@ class EnergyGuard:
         part, found = self._corrected(state, force, (limit - lowest) / (energy - lowest))
         return (part, found) if found <= limit else (alone, lowest)
 
-    def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[SteppedFrame, float]:
+    def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[Frame, float]:
         made = self._model.step(self._prepared.batch, state, force, self._prepared, scale)
-        return made, self._energy(_after(made, state))
+        return made, self._energy(made.following(state))
 
     def _energy(self, state: SimState) -> float:
         return float(self._model.energy(self._prepared.batch, state, self._prepared))
-
-
-def _after(step: SteppedFrame, state: SimState) -> SimState:
-    return SimState(step.positions, state.positions)

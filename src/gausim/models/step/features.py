@@ -18,16 +18,6 @@ TINY = 1e-6
 FLOOR_FEATURES = 4
 
 
-@dataclass(frozen=True, eq=False)
-class UnitState:
-    """Aggregated state of the N units of one level (or of their parents), in diagonals of the scene."""
-
-    rest: Float[Tensor, "N 3"]  # X
-    now: Float[Tensor, "N 3"]  # x_t
-    before: Float[Tensor, "N 3"]  # x_{t-1}
-    after: Float[Tensor, "N 3"]  # the predicted position at t+1 where it is known (parents), else the coarse prediction
-
-
 @dataclass(frozen=True)
 class FeatureOptions:
     """Choice of the network's input features.
@@ -119,20 +109,22 @@ def network_inputs(
     selects positions of the coarse prediction instead of the current ones.
     """
     coarsely = above.carry(target)
-    # Stacked and gathered together: on a CPU the number of operations dominates the cost.
-    own = UnitState(*(torch.stack((unit.rest, unit.now, unit.before, coarsely)) / size).unbind())
-    parents = torch.stack((above.rest, above.now, above.before, above.after)).index_select(1, above.index)
-    parent = UnitState(*(parents / size).unbind())
-    edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
+    # Positions at rest, at t, t - 1 and t + 1 of units and parents in diagonals, stacked and gathered together: on a
+    # CPU the number of operations dominates the cost.
+    own = torch.stack((unit.rest, unit.now, unit.before, coarsely)) / size
+    parents = torch.stack((above.rest, above.now, above.before, above.after)).index_select(1, above.index) / size
+    edges = edge_features(own, parents, edge_index, dt, options, coarse=coarse)
+    rest, now, before, after = own.unbind()
     if options.velocities:
-        inertial = -(parent.after - 2 * parent.now + parent.before) / dt**2
-        local = own.after - parent.after if coarse else own.now - parent.now
-        columns = [inertial, (local - (own.before - parent.before)) / dt]
+        _, parent, parent_before, parent_after = parents.unbind()
+        inertial = -(parent_after - 2 * parent + parent_before) / dt**2
+        local = after - parent_after if coarse else now - parent
+        columns = [inertial, (local - (before - parent_before)) / dt]
         if options.rest_inputs:
-            columns += [own.now - own.rest, (own.after - own.now) / dt]
+            columns += [now - rest, (after - now) / dt]
     else:
         lever = (unit.rest - above.rest.index_select(0, above.index)) / size
-        columns = [lever, own.now - own.rest, (coarsely - target) / size]
+        columns = [lever, now - rest, (coarsely - target) / size]
     columns += [unit.log_density[:, None], unit.attributes]
     if options.floor:
         near = unit.floor
@@ -141,8 +133,8 @@ def network_inputs(
 
 
 def edge_features(
-    unit: UnitState,
-    barycentre: UnitState,
+    units: Float[Tensor, "4 N 3"],
+    parents: Float[Tensor, "4 N 3"],
     edge_index: Int[Tensor, "2 E"],
     dt: Float[Tensor, "N 1"],
     options: FeatureOptions,
@@ -151,11 +143,12 @@ def edge_features(
 ) -> Float[Tensor, "E C"]:
     """Stretch ratio, direction, relative velocity and relative angle about the destination's barycentre.
 
-    With ``coarse`` they are computed from the coarse prediction and the parent's new position instead of x_t.
+    ``units`` and their ``parents`` are positions at rest, at t, t - 1 and t + 1 [diagonals]; t + 1 is the coarse
+    prediction of units. With ``coarse`` the features are computed from t + 1 instead of t.
     """
     s, d = edge_index
-    current, centre = (unit.after, barycentre.after) if coarse else (unit.now, barycentre.now)
-    places = torch.stack((unit.rest, current, unit.before), 1)
+    current = 3 if coarse else 1
+    places = torch.stack((units[0], units[current], units[2]), 1)
     source, destination = places.index_select(0, s), places.index_select(0, d)
     offset = destination - source
     rest, now, before = offset.unbind(1)
@@ -165,13 +158,13 @@ def edge_features(
         columns.append((now - before) / dt.index_select(0, d))
     if options.rest_inputs:
         columns += [rest, now - rest]
-    about = torch.stack((barycentre.rest, centre), 1).index_select(0, d)
+    about = torch.stack((parents[0], parents[current]), 1).index_select(0, d)
     columns.append(_angle_change(destination[:, :2] - about, source[:, :2] - about))
     return torch.cat(columns, -1)
 
 
 def _angle_change(a: Float[Tensor, "E 2 3"], b: Float[Tensor, "E 2 3"]) -> Float[Tensor, "E 2"]:
-    """Cosine and sine of the change of the angle between two vectors from rest to now; axis 1 of both is (rest, now)."""
+    """Cosine and sine of the change of the angle between two vectors from rest to now, which are on axis 1."""
     dot = (a * b).sum(-1, keepdim=True)
     scale = safe_norm(a) * safe_norm(b)
     # The floor is the square of that of lengths: a unit on its barycentre gives 0, not 1 / length.

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gausim.core import Frame
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.ops.deformation import apply, polar_rotation
 
@@ -72,9 +73,7 @@ def advance(
     return accumulated, rotation @ above.rotation.index_select(0, above.index), after
 
 
-def inherit(
-    finest: Solved, template: Float[Tensor, "N 3 3"] | None, batch: SceneBatch
-) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+def inherit(finest: Solved, template: Float[Tensor, "N 3 3"] | None, batch: SceneBatch) -> Frame:
     """Positions x_c + G_c (X_k - X_c) of all kernels, G and Q of the units and identity rows.
 
     Args:
@@ -93,4 +92,4 @@ def inherit(
     positions = torch.where((batch.inherited < 0)[:, None], batch.rest, moved)
     identity = torch.eye(3, dtype=moved.dtype, device=moved.device).expand(batch.padded, 3, 3)
     rows = batch.rows
-    return positions, identity.index_copy(0, rows, deformation_gradient), identity.index_copy(0, rows, rotation)
+    return Frame(positions, identity.index_copy(0, rows, deformation_gradient), identity.index_copy(0, rows, rotation))

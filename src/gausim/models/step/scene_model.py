@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import FixedUnits, fixed_units
+from gausim.models.hierarchy.units import FixedUnits, UnitMotion, fixed_units
 from gausim.models.reference.surroundings import SceneSurroundings
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
@@ -22,7 +22,7 @@ from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.modal import ModalScene
 from gausim.models.template.solid import SolidSettings
-from gausim.models.template.template import Motion, PreparedScenes, Property, Template, local_means
+from gausim.models.template.template import PreparedScenes, Property, Template, local_means
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -61,7 +61,7 @@ class SceneModel(nn.Module, ABC):
                 f"{len(scenes)} scenes and {len(fps)} frame rates given; expected one rate per scene, at least one."
             )
         self.scenes, self.fps = tuple(scenes), tuple(fps)
-        self.predicted_levels, self._in_body_frame = settings.predicted, settings.body_frame
+        self.predicted_levels = settings.predicted
         self.body_axes = [body_axes(s) if settings.body_frame else np.eye(3) for s in scenes]
         self.hierarchies = tuple(
             build_hierarchy(
@@ -102,9 +102,9 @@ class SceneModel(nn.Module, ABC):
         for own in self.surroundings:
             cast(SceneSurroundings, own).solid = solid
 
-    def frames(self, batch: SceneBatch) -> Frames | None:
-        """Body axes for every unit of a batch; None where scene axes are used."""
-        return Frames.of(batch, self.axes, self.origins) if self._in_body_frame else None
+    def frames(self, batch: SceneBatch) -> Frames:
+        """The axes of every unit of a batch: those of its body, or of the scene."""
+        return Frames.of(batch, self.axes, self.origins)
 
     def units_of_kernels(self, scene_id: int) -> tuple[Int[Tensor, " K"], ...]:
         """The unit of every kernel of the scene at levels 1..L; -1 for kernels that are never simulated."""
@@ -142,9 +142,7 @@ class SceneModel(nn.Module, ABC):
         batch = self.batch((scene_id,))
         _, fraction, _ = self.units(batch)
         projection = self.modal_scene(scene_id).projection.unflatten(0, (-1, 3))
-        frames = self.frames(batch)
-        if frames is not None:
-            projection = frames.axes[-1].mT @ projection
+        projection = self.frames(batch).axes[-1].mT @ projection
         return fraction[:, None, None] * projection.index_select(0, batch.finest)
 
     def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
@@ -273,6 +271,6 @@ class SceneModel(nn.Module, ABC):
             normaliser.frozen = True
 
 
-def _finest(prepared: Prepared, state: SimState) -> Motion:
+def _finest(prepared: Prepared, state: SimState) -> UnitMotion:
     now, before = prepared.finest(state.positions), prepared.finest(state.previous)
-    return Motion(prepared.levels[-1].rest, now, before)
+    return UnitMotion(prepared.levels[-1].rest, now, before)

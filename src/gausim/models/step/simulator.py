@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
+from gausim.core import Frame, GaussianScene, SimState
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
-from gausim.models.hierarchy.units import FixedUnits, weighted_sum
-from gausim.models.reference.reference import HandMotion, Placed, Reference, UnitMotion
+from gausim.models.hierarchy.units import FixedUnits, UnitMotion, weighted_sum
+from gausim.models.reference.reference import HandMotion, Reference
 from gausim.models.reference.surroundings import reference_of
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
@@ -21,23 +21,12 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.material import MaterialTemplate
-from gausim.models.template.template import Motion, Template
+from gausim.models.template.template import Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 
 DEFAULT_HIERARCHY, DEFAULT_FEATURES = HierarchySettings(), FeatureOptions()
 DEFAULT_HEAD, DEFAULT_ROLLOUT = Head(), RolloutSettings()
-
-
-@dataclass(frozen=True, eq=False)
-class Step(SteppedFrame):
-    """Result of a step: x_{t+1} of a batch, and deformation gradients G and rotations Q of its finest units."""
-
-    # sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, in masses and diagonals of the scene; zero without
-    # conserve_momentum
-    momentum: Float[Tensor, ""]
-    predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # F per predicted level, coarse to fine
-    state: SimState | None = None  # where the next step starts, if an impact changed a velocity within the frame
 
 
 class GausSim(SceneModel):
@@ -84,7 +73,8 @@ class GausSim(SceneModel):
         )  # fmt: skip
         self.shape_bodies(self.template.solid)
         self.predictor = DeformationPredictor(
-            features=features.of(scenes), network=network, head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
+            features=features.of(scenes), network=network, head=head, edges=hierarchy.edges,
+            conserve_mass=conserve_mass,
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch, *, isolated: bool = False, driven: bool = False) -> Prepared:
@@ -95,20 +85,20 @@ class GausSim(SceneModel):
         lets the pins of scenes without recorded hands move, as one hand.
         """
         mass, fraction, levels = self.units(batch)
-        top, rest = batch.levels[0], levels[-1].rest
+        top, units, frames = batch.levels[0], levels[-1], self.frames(batch)
         roots = batch.rest.index_select(0, batch.simulated.index_select(0, top.parent))
-        frames = self.frames(batch)
-        if frames is not None:
-            levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
-            roots = frames.into(0, roots)
-        template = self.template.prepare(batch, levels[-1])
-        reference = Reference(batch)
+        levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
+        template, reference = self.template.prepare(batch, levels[-1]), Reference(batch, units.rest)
         if not isolated:
-            axes = None if frames is None else frames.axes[-1]
-            units = replace(levels[-1], rest=rest)  # in scene axes
-            reference = reference_of(self.surroundings, batch, mass, units, template, axes, driven=driven)
-        prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, reference)
-        return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
+            reference = reference_of(
+                self.surroundings, batch, mass, units, template, frames.axes[-1], driven=driven
+            )  # fmt: skip
+        none = (batch.rest.new_zeros(()),) * len(levels)
+        prepared = Prepared(
+            batch, mass, fraction, levels, Solved.roots(frames.into(0, roots)), template, frames, units.rest, none,
+            reference,
+        )  # fmt: skip
+        return self._anchored(prepared) if self.predictor.head.anchor else prepared
 
     def step(
         self,
@@ -118,7 +108,7 @@ class GausSim(SceneModel):
         prepared: Prepared | None = None,
         correction_scale: float = 1.0,
         hands: Sequence[HandMotion | None] | None = None,
-    ) -> Step:
+    ) -> Frame:
         """Predicts the next frame.
 
         Args:
@@ -131,57 +121,64 @@ class GausSim(SceneModel):
             hands: poses of the hands of every member before, at and after this frame; None: all pins are at rest.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
-        if force is not None:
-            state = self.pushed(prepared, state, force)
-        carried, units = prepared.carried(state, hands)
-        finest, template, momentum, predicted = self._descend(prepared, units, correction_scale, [])
-        finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
-        x, deformation, rotations, before = carried.place(Placed(*inherit(finest, template, batch)))
-        after = None if before is None else SimState(x, before)
-        return Step(x, deformation, rotations, momentum, tuple(predicted), after)
+        state = state if force is None else self.pushed(prepared, state, force)
+        # Kernels are aggregated to centres of mass of the finest units, relative to the reference that carries them.
+        carried, motion = prepared.aggregate(state, hands)
+        # The levels are solved coarse to fine. Zero output of the network leaves the template as it is.
+        finest, template, momentum, predicted = self._solve(prepared, motion, correction_scale, [])
+        finest, template, gradients = prepared.in_scene_axes(finest, template, predicted)
+        # Kernels inherit the motion and the deformation of their finest unit, and go back to the scene.
+        frame = replace(inherit(finest, template, batch), momentum=momentum, predicted=gradients)
+        return carried.place(frame)
 
-    def _descend(
-        self, prepared: Prepared, units: UnitMotion, correction_scale: float, outputs: list[Tensor]
+    def _solve(
+        self, prepared: Prepared, motion: UnitMotion, correction_scale: float, outputs: list[Tensor]
     ) -> tuple[Solved, Tensor | None, Tensor, list[Tensor]]:
         """Solves the predicted levels, coarse to fine: returns the finest one, the template's P, momentum and all F.
 
         The network's outputs, before those at rest are subtracted, are appended to ``outputs``.
         """
-        # The template predicts the finest units; coarser ones are their centres of mass, at all three times.
-        rest = prepared.levels[-1].rest
-        seen = prepared.template.carried(Motion(rest, units.now, units.before))
-        template = prepared.template(seen, units.load)
-        now = self.predictor.features.positions(seen.before, seen.now, template.positions)
-        states = [prepared.per_level(x) for x in (now, seen.before, template.positions)]
-        above, momentum, predicted = prepared.roots, rest.new_zeros(()), []
+        # The template predicts the finest units from what its modes carry of their motion. Coarser units are their
+        # centres of mass, at all three times.
+        motion = prepared.template.carried(motion)
+        targets, gradients = prepared.template(motion)
+        now = self.predictor.features.positions(motion.before, motion.now, targets)
+        states = [prepared.per_level(x) for x in (now, motion.before, targets)]
+        above, momentum, predicted = prepared.roots, targets.new_zeros(()), []
         unit_of_correction = prepared.template.correction_unit()
-        for position, (level, fixed, x, previous, target, floor) in enumerate(
-            zip(prepared.batch.levels, prepared.levels, *states, prepared.floors(units), strict=True)
+        for position, (level, fixed, x, before, target, floor) in enumerate(
+            zip(prepared.batch.levels, prepared.levels, *states, prepared.floors(motion), strict=True)
         ):
-            if position:
-                above = replace(above, index=level.parent)
-            unit = Units(fixed.rest, x, previous, fixed.mass, fixed.log_density, fixed.attributes, floor)
+            above = replace(above, index=level.parent) if position else above
+            unit = Units(fixed.rest, x, before, fixed.mass, fixed.log_density, fixed.attributes, floor)
+            # Inputs from the unit, its parent and its neighbours. The output at rest is subtracted.
             output = self.predictor(level, unit, above, target, position)
             outputs.append(output)
-            moved = output if prepared.still is None else output - prepared.still[position]
-            scale = correction_scale * level.free
-            if unit_of_correction is not None:
-                scale = scale * unit_of_correction.index_select(0, level.member)[:, None]
-            deformation_gradient, rotation = self.predictor.deformation_gradient(moved * scale, level, above, target)
+            scale = correction_scale * _scale(level, unit_of_correction)
+            output = (output - prepared.rest_outputs[position]) * scale
+            # F of the unit about its parent, with det F = 1 where mass is conserved.
+            deformation_gradient, rotation = self.predictor.deformation_gradient(output, level, above, target)
             predicted.append(deformation_gradient)
+            # x = x_p + C (T - T_p) with C = F C_p.
             accumulated, turned, after = advance(deformation_gradient, rotation, target, above)
+            # The centre of mass of a parent's children is to stay where the parent is.
             if position and self.conserve_momentum:
                 momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1])
-            above = Solved(unit.rest, x, previous, after, target, accumulated, turned, above.index)
-        return above, template.deformation_gradients, momentum, predicted
+            above = Solved(unit.rest, x, before, after, target, accumulated, turned, above.index)
+        return above, gradients, momentum, predicted
 
-    def _outputs_at_rest(self, prepared: Prepared) -> tuple[Tensor, ...]:
-        """The network's output for every unit of every predicted level at rest."""
+    def _anchored(self, prepared: Prepared) -> Prepared:
+        """With the network's outputs for all units at rest, so that rest is an equilibrium."""
         rest = prepared.levels[-1].rest
         outputs: list[Tensor] = []
         with gathering_nothing(normalisers_of(self.predictor)):
-            self._descend(prepared, UnitMotion(rest, rest, None), 0.0, outputs)
-        return tuple(outputs)
+            self._solve(prepared, UnitMotion(rest, rest, rest), 0.0, outputs)
+        return replace(prepared, rest_outputs=tuple(outputs))
+
+
+def _scale(level: LevelBatch, unit: Float[Tensor, " S"] | None) -> Float[Tensor, "N 1"]:
+    """Factor on the output of every unit: 0 for pinned ones, else its member's unit of corrections."""
+    return level.free if unit is None else level.free * unit.index_select(0, level.member)[:, None]
 
 
 def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, above: FixedUnits) -> Tensor:

@@ -27,6 +27,7 @@ from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.models.template.springs import unit_springs
 from gausim.models.template.template import PreparedScenes, Property, Template
 
+COARSE = SolidSettings(0.12, 0.0)
 # Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
 # modes.
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
@@ -165,7 +166,7 @@ class ElasticTemplate(Template):
         period: float = 8.0,
         amplitude: float = 0.02,
         geometric: float = 1.0,
-        solid: SolidSettings = SolidSettings(0.12, 0.0),
+        solid: SolidSettings = COARSE,
         attributes: int = 0,
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,

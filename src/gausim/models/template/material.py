@@ -68,6 +68,9 @@ SPRINGS_OF_LAW = {"solid": 0.0, "springs": 1.0}
 REFERENCE_FPS = 24.0
 
 
+DEFAULT_SOLID = SolidSettings()
+
+
 @dataclass(frozen=True)
 class Links:
     """Links between neighbouring units."""
@@ -119,7 +122,7 @@ class MaterialTemplate(Template):
         attributes: int,
         frames: Sequence[np.ndarray],
         modes: int = 48,
-        solid: SolidSettings = SolidSettings(),
+        solid: SolidSettings = DEFAULT_SOLID,
         links: Links = Links(),
         law: str = "solid",
         own_matrices: bool = False,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
-from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.hierarchy.units import FixedUnits, UnitMotion
 from gausim.models.template.modal import ModalScene
 from gausim.models.template.solid import SolidSettings
 from gausim.ops.deformation import bounded_deformation
@@ -28,23 +28,6 @@ from gausim.ops.deformation import bounded_deformation
 MIN_DETERMINANT = 0.2
 ROWS = 1024  # of a matrix of distances that are in memory at once
 DENSITY = "density over that at the beginning of training"
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Unit positions of the finest predicted level [scene units]."""
-
-    rest: Float[Tensor, "N 3"]
-    now: Float[Tensor, "N 3"]
-    before: Float[Tensor, "N 3"]
-
-
-@dataclass(frozen=True, eq=False)
-class TemplateState:
-    """The template of the finest predicted level."""
-
-    positions: Float[Tensor, "N 3"]  # unit positions [scene units]
-    deformation_gradients: Float[Tensor, "N 3 3"] | None  # P of each unit, or None for the identity
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +54,9 @@ class PreparedTemplate:
         """Stores where the members' units are."""
         self.spans, self.device = batch.levels[-1].spans, batch.rest.device
 
-    def __call__(self, motion: Motion, load: Float[Tensor, "N 12"] | None = None) -> TemplateState:
-        """The template state at t + 1; for ``load`` see :class:`gausim.models.reference.reference.UnitMotion`."""
-        return TemplateState(motion.rest, None)
+    def __call__(self, motion: UnitMotion) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3 3"] | None]:
+        """Positions T of the units at t + 1, and their deformation gradients P; None for the identity."""
+        return motion.rest, None
 
     def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member of the batch yields to impulses.
@@ -86,7 +69,7 @@ class PreparedTemplate:
         none = torch.zeros(0, 0, device=self.device)
         return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none, none, none), none.new_ones(())
 
-    def carried(self, motion: Motion) -> Motion:
+    def carried(self, motion: UnitMotion) -> UnitMotion:
         """The part of the motion that is input to template and network; here all of it."""
         return motion
 
@@ -98,7 +81,7 @@ class PreparedTemplate:
         """
         raise NotImplementedError("the rest state has no energy")
 
-    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
+    def energy(self, motion: UnitMotion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch.
 
         Raises:
@@ -106,7 +89,7 @@ class PreparedTemplate:
         """
         raise NotImplementedError("the rest state has no energy")
 
-    def dissipated(self, motion: Motion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
+    def dissipated(self, motion: UnitMotion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
         """Energy that the damping takes from every member in a step from ``previous`` (t - 1) to the end of ``motion``.
 
         Raises:
@@ -182,28 +165,29 @@ class PreparedScenes(PreparedTemplate):
         order = torch.cat([rows for _, rows, _ in self.parts])
         self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
 
-    def _displacements(self, motion: Motion, rows: Tensor, members: list[int]) -> tuple[Tensor, Tensor]:
+    def _displacements(self, motion: UnitMotion, rows: Tensor, members: list[int]) -> tuple[Tensor, Tensor]:
         rest = motion.rest
         now, before = (
-            self._own(x, rows, members) - self._own(rest, rows, members) for x in (motion.now, motion.before)
+            self._members_of(x, rows, members) - self._members_of(rest, rows, members)
+            for x in (motion.now, motion.before)
         )
         return now, before
 
-    def _own(self, values: Tensor, rows: Tensor, members: list[int]) -> Tensor:
+    def _members_of(self, values: Tensor, rows: Tensor, members: list[int]) -> Tensor:
         """Values (S, N, C) of one scene's members from those of all units (N, C)."""
         own = values if len(self.parts) == 1 else values.index_select(0, rows)
         return own.view(len(members), -1, values.shape[1])
 
-    def __call__(self, motion: Motion, load: Float[Tensor, "N 12"] | None = None) -> TemplateState:
+    def __call__(self, motion: UnitMotion) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3 3"] | None]:
         """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
         made = []
         for part, rows, members in self.parts:
-            own = None if load is None else self._own(load, rows, members)
-            made.append(part(*self._displacements(motion, rows, members), own).flatten(0, 1))
+            load = None if motion.load is None else self._members_of(motion.load, rows, members)
+            made.append(part(*self._displacements(motion, rows, members), load).flatten(0, 1))
         moved = self._in_order(made)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
-        return TemplateState(motion.rest + moved[:, :3], deformation)
+        return motion.rest + moved[:, :3], deformation
 
     def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member yields to impulses: by the modes of its scene."""
@@ -212,35 +196,35 @@ class PreparedScenes(PreparedTemplate):
         mass = part.mass.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
         return modes, slopes.unflatten(1, (3, 3)), (part.inertia, part.stiffness, part.damping), mass
 
-    def carried(self, motion: Motion) -> Motion:
+    def carried(self, motion: UnitMotion) -> UnitMotion:
         """The part of the motion that is input to template and network, scene by scene."""
         made = []
         for part, rows, members in self.parts:
             both = torch.cat(self._displacements(motion, rows, members))
             made.append(torch.stack([x.flatten(0, 1) for x in part.carried(both).chunk(2)]))
         seen = made[0] if len(made) == 1 else torch.cat(made, 1).index_select(1, self._places)
-        return Motion(motion.rest, motion.rest + seen[0], motion.rest + seen[1])
+        return replace(motion, now=motion.rest + seen[0], before=motion.rest + seen[1])
 
     def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The part of a displacement by an impulse that its frame does not reach, scene by scene."""
-        parts = [part.withheld(self._own(displacement, rows, members)) for part, rows, members in self.parts]
+        parts = [part.withheld(self._members_of(displacement, rows, members)) for part, rows, members in self.parts]
         return self._in_order([made.flatten(0, 1) for made in parts])
 
     def _in_order(self, made: list[Tensor]) -> Tensor:
         """Values of the units, scene by scene, in the order of the batch."""
         return made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
 
-    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
+    def energy(self, motion: UnitMotion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
         return self._by_member([part.energy(*z) for part, z in self._coordinates(motion)])
 
-    def dissipated(self, motion: Motion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
+    def dissipated(self, motion: UnitMotion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
         """Energy that the damping takes from every member in a step from ``previous`` to the end of ``motion``."""
         earlier = self._coordinates(replace(motion, before=previous))
         found = zip(self._coordinates(motion), earlier, strict=True)
         return self._by_member([part.dissipated(*z, before) for (part, z), (_, (_, before)) in found])
 
-    def _coordinates(self, motion: Motion) -> list[tuple[ModalScene, tuple[Tensor, Tensor]]]:
+    def _coordinates(self, motion: UnitMotion) -> list[tuple[ModalScene, tuple[Tensor, Tensor]]]:
         return [
             (part, part.coordinates(*self._displacements(motion, rows, members))) for part, rows, members in self.parts
         ]

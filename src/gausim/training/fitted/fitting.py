@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
-from gausim.core import FittedDynamics, FittedMethod, FittedState, GaussianScene, SimState, Trajectory
+from gausim.core import FittedDynamics, FittedMethod, FittedState, Frame, GaussianScene, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
 from gausim.models.hierarchy.batch import Member
@@ -23,7 +23,6 @@ from gausim.training.fitted.stages import FitPlan, StagedCurriculum
 from gausim.training.method import Method, Moment, Task
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.plan import TrainingPlan
-from gausim.training.rollout import Frame
 from gausim.training.terms.term import StepInputs, Term
 
 
@@ -82,7 +81,7 @@ class Sequences(nn.Module):
             torch.cat([getattr(p, name) for p in parts]) for name in ("deformation_gradients", "rotations")
         )
         no_momentum = rotations.new_zeros(())
-        return Frame(following.positions, deformation_gradients, rotations, no_momentum, following)
+        return Frame(following.positions, deformation_gradients, rotations, following, no_momentum)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The method's parameter groups."""

@@ -15,7 +15,8 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.losses.image import ImageLoss
-from gausim.models.reference.reference import Carried, UnitMotion
+from gausim.models.hierarchy.units import UnitMotion
+from gausim.models.reference.reference import Carried
 from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch
 from gausim.training.rollout import States

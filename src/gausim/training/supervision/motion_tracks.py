@@ -27,11 +27,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError, SmoothMotions
+from gausim.core import ConfigError, Frame, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
-from gausim.models.reference.reference import Carried, Placed
+from gausim.models.reference.reference import Carried
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
 from gausim.training.supervision.comparison import channels
@@ -161,10 +161,15 @@ class MotionTracker:
         rest = self._sources.scenes[sample.scene_id].means.to(places)
         deformation_gradients = motions.deformations(places)
         rotations = polar_rotation(deformation_gradients.detach())
-        state = Placed(rest + motions.displacements(places), deformation_gradients, rotations)
+        positions = rest + motions.displacements(places)
         if carried is not None:
-            state = Placed(*(x[None] for x in carried.place(Placed(*(x[0] for x in state[:3])))[:3]))
-        drawn = draw(self._sources.renderer, appearance, *state[:3], motions.unit_of_kernel, sample.cameras)
+            frame = carried.place(Frame(positions[0], deformation_gradients[0], rotations[0]))
+            positions, rotations = frame.positions[None], frame.rotations[None]
+            deformation_gradients = frame.deformation_gradients[None]
+        drawn = draw(
+            self._sources.renderer, appearance, positions, deformation_gradients, rotations, motions.unit_of_kernel,
+            sample.cameras,
+        )  # fmt: skip
         return channels(drawn.rgb, drawn.alpha, self._sources.loss)
 
     def _curvature(self, sample: SequenceSample, factor: int) -> Curvature:
@@ -215,7 +220,7 @@ class TrackSupervision(PointSupervision):
         like = self.tracker.motions(sample.scene_id).displacement_gradients[..., 0]
         still = torch.eye(3).to(positions).expand_as(like)
         for frame, (carried, _) in enumerate(self._sources.references(sample.sequence_id, len(positions) - 1) or (), 1):
-            positions[frame] = carried.place(Placed(positions[frame], still, still)).positions
+            positions[frame] = carried.place(Frame(positions[frame], still, still)).positions
         return GroundTruth(scene.means[free], positions[:, free])
 
     def state_dict(self) -> dict[int, Tensor]:

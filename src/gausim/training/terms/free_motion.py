@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, SimState
+from gausim.core import ConfigError, Frame, SimState
 from gausim.data.sampler import hash_seed
 from gausim.losses.objective import Objective
-from gausim.training.contracts import SceneBatch, Step
+from gausim.training.contracts import SceneBatch
 from gausim.training.graphed import GraphedRollouts
 from gausim.training.rollout import after
 
@@ -60,7 +60,7 @@ def energy_growth(
         before, state = now.detach(), after(made, state)
 
 
-def _mean_energy(model: Any, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
+def _mean_energy(model: Any, batch: SceneBatch, state: SimState, made: list[Frame]) -> Float[Tensor, " S"]:
     positions = [state.positions, *(step.positions for step in made)]
     prepared = model.prepare(batch, isolated=True)
     energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]

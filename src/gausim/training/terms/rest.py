@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from gausim.core import SimState
+from gausim.core import Frame, SimState
 from gausim.losses.objective import static_loss
-from gausim.training.contracts import SceneBatch, Simulator, Step
+from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.rollout import States
 from gausim.training.terms.term import StepInputs
 
@@ -37,8 +37,8 @@ def rest_term(step: StepInputs) -> None:
     step.statistics.static = loss.detach()
 
 
-def _step(simulator: Simulator, batch: SceneBatch) -> Step:
+def _step(simulator: Simulator, batch: SceneBatch) -> Frame:
     """One step from rest, without surroundings: what falls does not stay."""
     still = SimState(batch.rest, batch.rest)
-    made: Step = simulator.step(batch, still, prepared=simulator.prepare(batch, isolated=True))
+    made: Frame = simulator.step(batch, still, prepared=simulator.prepare(batch, isolated=True))
     return made
