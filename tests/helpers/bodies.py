@@ -88,5 +88,5 @@ def pull_of(
     springs: Springs | FiniteStrain, z: Tensor, factor: Tensor | float = 1.0, strain: Tensor | None = None
 ) -> Tensor:
     """Nonlinear force (S, M) of springs that stay in the state z (S, M)."""
-    taut = None if strain is None else springs.strained(strain)
-    return springs.between(*[springs.stretched(z, taut)] * 2, factor)
+    reference = None if strain is None else springs.reference_strain(strain)
+    return springs.between(*[springs.strain_state(z, reference)] * 2, factor)

@@ -34,14 +34,14 @@ def _states(size: float) -> Tensor:
     return size * torch.randn(2, 3, MODES, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-def _strained(slope: Tensor) -> Tensor:
+def _even_strain(slope: Tensor) -> Tensor:
     """A displacement gradient (3, 3) of the reference that is the same at all units."""
     return slope.flatten().expand(1, UNITS, 9)
 
 
 def test_the_energy_of_cells_is_that_of_saint_venant_and_kirchhoff_beyond_the_linear() -> None:
     z, factor = _states(0.2)[0], _factor(CELLS)
-    state, expected = CELLS.stretched(z), torch.zeros(3, dtype=torch.float64)
+    state, expected = CELLS.strain_state(z), torch.zeros(3, dtype=torch.float64)
     for s in range(3):
         for n in range(UNITS):
             h = (CELLS.gradients.view(UNITS, 9, MODES)[n] @ z[s]).view(3, 3)
@@ -70,7 +70,7 @@ def _spring_energies(z: Tensor, slope: Tensor | float = 0.0) -> tuple[Tensor, Te
 def test_the_energy_of_springs_is_that_of_their_lengths_beyond_the_linear() -> None:
     z = _states(0.2)[0]
     whole, linear = _spring_energies(z)
-    torch.testing.assert_close(SPRINGS.potential(SPRINGS.stretched(z), _factor(SPRINGS)), whole - linear)
+    torch.testing.assert_close(SPRINGS.potential(SPRINGS.strain_state(z), _factor(SPRINGS)), whole - linear)
 
 
 def test_springs_start_from_the_lengths_of_a_strained_reference() -> None:
@@ -86,7 +86,7 @@ def test_springs_start_from_the_lengths_of_a_strained_reference() -> None:
 @LAWS
 def test_the_force_is_the_slope_of_the_potential_and_of_second_order(law: Any) -> None:
     z, factor = _states(0.2)[0].requires_grad_(), _factor(law)
-    (slope,) = torch.autograd.grad(law.potential(law.stretched(z), factor).sum(), z)
+    (slope,) = torch.autograd.grad(law.potential(law.strain_state(z), factor).sum(), z)
     torch.testing.assert_close(pull_of(law, z, factor), -slope)
     small, large = (pull_of(law, size * z.detach(), factor).norm() for size in (1e-4, 1e-3))
     assert float(small / large) == pytest.approx(0.01, rel=0.1) and not pull_of(law, 0 * z, factor).any()
@@ -97,7 +97,7 @@ def test_the_force_is_the_slope_of_the_potential_and_of_second_order(law: Any) -
 @torch.no_grad()
 def test_the_work_of_the_mean_force_is_what_the_energy_loses(law: Any, damping: float) -> None:
     (z, other), factor = _states(0.3), _factor(law)
-    first, second = law.stretched(z), law.stretched(other)
+    first, second = law.strain_state(z), law.strain_state(other)
     work = (law.between(first, second, factor, damping) * (other - z)).sum(-1)
     lost = law.potential(first, factor) - law.potential(second, factor)
     torch.testing.assert_close(work, lost - law.dissipated(first, second, factor, damping))
@@ -108,14 +108,14 @@ def test_the_work_of_the_mean_force_is_what_the_energy_loses(law: Any, damping: 
 @pytest.mark.parametrize("damping", [0.0, 0.2])
 @torch.no_grad()
 def test_the_stiffness_of_what_is_taut_is_the_slope_of_the_force(law: Any, damping: float) -> None:
-    taut, factor = law.strained(_strained(0.3 * EYE)), _factor(law)
+    reference, factor = law.reference_strain(_even_strain(0.3 * EYE)), _factor(law)
     z, other = _states(0.005)[:, :1]
-    first = law.stretched(z, taut)
+    first = law.strain_state(z, reference)
 
     def force(q: Tensor) -> Tensor:
-        return law.between(first, law.stretched(q[None], taut), factor, damping)[0]
+        return law.between(first, law.strain_state(q[None], reference), factor, damping)[0]
 
-    found = law.stiffening(first, law.stretched(other, taut), factor, damping)[0]
+    found = law.stiffening(first, law.strain_state(other, reference), factor, damping)[0]
     torch.testing.assert_close(found, -2 * torch.func.jacrev(force)(other[0]))
     assert float(torch.linalg.eigvalsh(law.stiffening(first, first, factor)[0])[0]) > 0
 
@@ -125,11 +125,11 @@ def test_the_stiffness_of_what_is_taut_is_the_slope_of_the_force(law: Any, dampi
 def test_what_is_compressed_counts_as_stiffer_than_it_is(law: Any) -> None:
     """As if it were as long as its rest length, or under a tension that balances the pressure: it does not buckle."""
     z, factor = _states(0.3)[0, 0], _factor(law)
-    ends = [law.stretched(z[None])] * 2
+    ends = [law.strain_state(z[None])] * 2
     own = -torch.func.jacrev(lambda q: pull_of(law, q[None], factor)[0])(z)
     least = torch.linalg.eigvalsh(law.stiffening(*ends, factor)[0] - own)
     assert least.min() > -1e-9 * least.max() and least.max() > 0
-    rest = [law.stretched(torch.zeros(1, MODES, dtype=torch.float64))] * 2
+    rest = [law.strain_state(torch.zeros(1, MODES, dtype=torch.float64))] * 2
     assert not law.stiffening(*rest, factor).abs().max() > 1e-6
 
 
@@ -141,14 +141,14 @@ def test_compressed_matter_does_not_make_the_stiffness_indefinite() -> None:
     linear = 2 * SECOND * torch.einsum("n,nabl,nabm->lm", weights[:, 0], strain, strain)
     trace = strain.diagonal(dim1=1, dim2=2).sum(-1)
     linear = linear + FIRST * torch.einsum("n,nl,nm->lm", weights[:, 1], trace, trace)
-    ends = [CELLS.stretched(_states(0.3)[0])] * 2
+    ends = [CELLS.strain_state(_states(0.3)[0])] * 2
     assert float(torch.linalg.eigvalsh(linear + CELLS.stiffening(*ends, factor)).min()) > -1e-9
 
 
 @torch.no_grad()
 def test_a_rotation_strains_nothing() -> None:
-    turned = _strained(quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64)) - EYE)
+    turned = _even_strain(quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64)) - EYE)
     still, factor = torch.zeros(1, MODES, dtype=torch.float64), _factor(SPRINGS)
-    assert float(CELLS.stretched(still, CELLS.strained(turned)).strain.abs().max()) < 1e-7
+    assert float(CELLS.strain_state(still, CELLS.reference_strain(turned)).strain.abs().max()) < 1e-7
     linear = SPRINGS.pull(turned, factor)
     assert float((pull_of(SPRINGS, still, factor, turned) + linear).norm()) < 1e-5 * float(linear.norm())

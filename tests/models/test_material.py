@@ -193,14 +193,14 @@ def test_cells_or_springs_are_what_is_nonlinear(hierarchy, finite: bool) -> None
     part = PreparedMaterial(body, matrices, 1.0)
     z = 0.1 * torch.randn(1, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     if finite:
-        expected = body.cells.potential(body.cells.stretched(z), matrices.units)
+        expected = body.cells.potential(body.cells.strain_state(z), matrices.units)
         linear = torch.einsum("np,pnlm->lm", matrices.units, body.stiffness)
     else:
-        expected = body.springs.potential(body.springs.stretched(z), matrices.springs)
+        expected = body.springs.potential(body.springs.strain_state(z), matrices.springs)
         linear = body.stretch.mT @ (matrices.springs[:, None] * body.stretch)
     still = 0.5 * ((z @ part.stiffness) * z).sum(-1)
     torch.testing.assert_close(part.energy(z, z), still + expected)
-    small = part.nonlinear.stretched(1e-4 * z)
+    small = part.nonlinear.strain_state(1e-4 * z)
     if finite:  # the mean strain near a unit lacks what varies around it
         gradient = (small.gradient + small.gradient.mT) / 2
         energy = (body.cells._stress(gradient, matrices.units) * gradient).sum()

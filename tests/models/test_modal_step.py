@@ -27,7 +27,7 @@ def test_the_step_solves_its_equation(body: partial) -> None:
     part = neural_model(template=body).modal_scene(0)
     z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     after = part.after(z, previous)
-    ends = [part.nonlinear.stretched(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
+    ends = [part.nonlinear.strain_state(middle) for middle in ((z + previous) / 2, (after + z) / 2)]
     bend, force = after - 2 * z + previous, part.nonlinear.between(*ends, part.factor, part.growth)
     lost = (z + bend / 4) @ part.stiffness + (z - previous + bend / 2) @ part.damping
     torch.testing.assert_close(bend @ part.inertia, force - lost, rtol=1e-3, atol=1e-3 * float(lost.abs().max()))
@@ -56,7 +56,7 @@ def test_resistance_to_growth_takes_the_energy_that_is_lost_and_none_from_a_rota
     assert float(energy[-1]) < 0.9 * float(energy[0]) and bool((lost > 0).all())
     law, turn = part.nonlinear, quaternion_to_matrix(torch.tensor([0.9, 0.1, -0.3, 0.3], dtype=torch.float64))
     turned = (turn - torch.eye(3)).flatten().expand(1, len(part.motions) // 12, 9)
-    ends = law.stretched(0 * now), law.stretched(0 * now, law.strained(turned))
+    ends = law.strain_state(0 * now), law.strain_state(0 * now, law.reference_strain(turned))
     assert float(law.dissipated(*ends, part.factor, 0.1)) < 1e-12
 
 

@@ -200,7 +200,7 @@ def test_modal_derivatives_let_a_bar_bend_far_at_the_cost_of_bending() -> None:
 
         def energy(z=z, values=values, cells=cells, factor=factor, bent=bent, free=free):
             q = bent + free * z
-            return 0.5 * (values * q.square()).sum() + cells.potential(cells.stretched(q[None]), factor)[0]
+            return 0.5 * (values * q.square()).sum() + cells.potential(cells.strain_state(q[None]), factor)[0]
 
         def closure(energy=energy, search=search, z=z):
             search.zero_grad()

@@ -100,7 +100,7 @@ def reference_of(
             continue
         rest, kernels = units.rest[span], batch.rest[member.kernels]
         contact, gravity = own.contact(rest), own.acceleration(float(batch.levels[-1].dt[span.start]), rest)
-        modes, slopes, matrices, whole = template.yielding(number)
+        modes, slopes, matrices, whole = template.compliance(number)
         turn = axes[span]  # to scene axes
         modes, slopes = turn.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", turn, slopes, turn)
         unit = member.unit_of_kernel

@@ -62,12 +62,12 @@ class Prepared:
     def _in_own_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return self.frames.into(len(self.levels) - 1, positions)
 
-    def withheld(self, state: SimState, displacement: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
+    def overshoot(self, state: SimState, displacement: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
         """The part of a displacement of the simulated kernels by an impulse that its frame does not reach."""
         batch, turned, axes = self.batch, self.reference.turned(state), self.frames.axes[-1]
         axes = axes if turned is None else axes @ turned.mT
         shifted = self.mean(torch.zeros_like(state.positions).index_copy(0, batch.simulated, displacement))
-        remainder = apply(axes.mT, self.template.withheld(apply(axes, shifted)))
+        remainder = apply(axes.mT, self.template.overshoot(apply(axes, shifted)))
         return remainder.index_select(0, batch.finest.index_select(0, batch.simulated))
 
     def per_level(self, finest: Float[Tensor, "N C"]) -> list[Tensor]:

@@ -149,14 +149,14 @@ class SceneModel(nn.Module, ABC):
         """The state after a force on free kernels has acted on it for a frame.
 
         The paper's is x_t + f dt^2 / (2 m). In templates with modes x_{t-1} gives the same velocity, f dt / m, less
-        what is withheld from it within the frame (:meth:`gausim.models.template.modal.ModalScene.withheld`).
+        what its frame does not reach (:meth:`gausim.models.template.modal.ModalScene.overshoot`).
         """
         batch = prepared.batch
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
         shift = shift.masked_fill(batch.pinned[:, None], 0.0)
         if not self.knows_energy:
             return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
-        gained = (2 * shift - prepared.withheld(state, 2 * shift)).masked_fill(batch.pinned[:, None], 0.0)
+        gained = (2 * shift - prepared.overshoot(state, 2 * shift)).masked_fill(batch.pinned[:, None], 0.0)
         return SimState(state.positions, state.previous.index_add(0, batch.simulated, gained, alpha=-1))
 
     @property

@@ -51,14 +51,14 @@ class FiniteStrain(nn.Module):
         self.register_buffer("measures", _measures(), persistent=False)
         self.register_buffer("moduli", moduli, persistent=False)
 
-    def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
+    def reference_strain(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
         """S of every unit."""
         return strain.unflatten(-1, (3, 3))
 
-    def stretched(self, z: Float[Tensor, "S M"], taut: Float[Tensor, "S N 3 3"] | None = None) -> Strained:
-        """The body in a state of the modes; ``taut`` is what the reference's strain changes (:meth:`strained`)."""
+    def strain_state(self, z: Float[Tensor, "S M"], reference: Float[Tensor, "S N 3 3"] | None = None) -> Strained:
+        """The body in a state of the modes; ``reference`` is that of :meth:`reference_strain`."""
         gradient = (z @ self.gradients.mT).unflatten(-1, (-1, 3, 3))
-        gradient = gradient if taut is None else gradient + taut
+        gradient = gradient if reference is None else gradient + reference
         return Strained(gradient, (gradient + gradient.mT + gradient.mT @ gradient) / 2)
 
     def between(

@@ -17,10 +17,10 @@ LEAST_LEFT = 0.1
 class NonlinearForce(Protocol):
     """What a body's forces are beyond those of small displacements (:mod:`gausim.models.template.springs`)."""
 
-    def strained(self, strain: Tensor) -> Tensor:
+    def reference_strain(self, strain: Tensor) -> Tensor:
         """What a strain (S, N, 9) of the reference changes."""
 
-    def stretched(self, z: Tensor, taut: Tensor | None = None) -> Any:
+    def strain_state(self, z: Tensor, reference: Tensor | None = None) -> Any:
         """The body in a state of the modes (S, M)."""
 
     def between(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
@@ -100,13 +100,13 @@ class ModalScene:
         """
         law, factor, damping = self.nonlinear, self.factor, self.growth
         speed, bend = z - previous, torch.zeros_like(z)
-        taut, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
+        reference, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
         if load is not None:
-            taut, force = law.strained(load[..., 3:]), force + self.force(load)
+            reference, force = law.reference_strain(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first, now = law.stretched(z - speed / 2, taut), law.stretched(z, taut)
+        first, now = law.strain_state(z - speed / 2, reference), law.strain_state(z, reference)
         for correction in range(self.corrections):
-            second = law.stretched(z + (speed + bend) / 2, taut)
+            second = law.strain_state(z + (speed + bend) / 2, reference)
             if correction < self.corrections - 1:
                 with torch.no_grad():
                     ends = (first, second) if correction else (now, now)
@@ -116,7 +116,7 @@ class ModalScene:
             bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
         return z + speed + bend
 
-    def withheld(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+    def overshoot(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """The part of a displacement by an impulse that its frame does not reach.
 
         Of its modal coordinates z these are z - (M + K / 4)^-1 M z / (1 - t), M after the inverse being the mass.
@@ -140,14 +140,14 @@ class ModalScene:
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness, factor = self.inertia.detach(), self.stiffness.detach(), self.factor.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-        return energy + self.nonlinear.potential(self.nonlinear.stretched(middle), factor)
+        return energy + self.nonlinear.potential(self.nonlinear.strain_state(middle), factor)
 
     def dissipated(
         self, after: Float[Tensor, "S M"], now: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]
     ) -> Float[Tensor, " S"]:
         """Energy lost to damping in a step: v^T D v of v = (z_{t+1} - z_{t-1}) / 2, and to growth."""
         speed, law = (after - previous) / 2, self.nonlinear
-        first, second = (law.stretched((now + end) / 2) for end in (previous, after))
+        first, second = (law.strain_state((now + end) / 2) for end in (previous, after))
         taken = law.dissipated(first, second, self.factor, self.growth)
         return ((speed @ self.damping) * speed).sum(-1) + taken
 

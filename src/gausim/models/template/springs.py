@@ -61,20 +61,20 @@ class Springs(nn.Module):
             self.register_buffer(name, torch.from_numpy(array).float(), persistent=False)
         self.register_buffer("ends", torch.from_numpy(np.ascontiguousarray(ends)), persistent=False)
 
-    def strained(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S E 3"]:
+    def reference_strain(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S E 3"]:
         """S d_0 of every spring, S the mean of both ends."""
         both = strain.index_select(1, self.ends.flatten()).unflatten(1, (2, -1)).mean(1)
         return (both.unflatten(-1, (3, 3)) @ self.offset[..., None])[..., 0]
 
     def pull(self, strain: Float[Tensor, "S N 9"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
         """Linear part of the modal forces of a strained reference."""
-        along = (self.strained(strain) * self.offset).sum(-1) / self.length.square()
+        along = (self.reference_strain(strain) * self.offset).sum(-1) / self.length.square()
         return -((factor * self.stiffness * along)[..., None] * self.offset).flatten(-2) @ self.modes
 
-    def stretched(self, z: Float[Tensor, "S M"], taut: Float[Tensor, "S E 3"] | None = None) -> Stretched:
-        """Every spring in a state of the modes; ``taut`` is what the reference's strain changes (:meth:`strained`)."""
+    def strain_state(self, z: Float[Tensor, "S M"], reference: Float[Tensor, "S E 3"] | None = None) -> Stretched:
+        """Every spring in a state of the modes; ``reference`` is that of :meth:`reference_strain`."""
         change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
-        change = change if taut is None else change + taut
+        change = change if reference is None else change + reference
         squared, along = self.length.square(), (self.offset * change).sum(-1)
         grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
         length = (squared + grown).clamp_min(1e-6 * squared).sqrt()

@@ -58,7 +58,7 @@ class PreparedTemplate:
         """Positions T of the units at t + 1, and their deformation gradients P; None for the identity."""
         return motion.rest, None
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+    def compliance(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member of the batch yields to impulses.
 
         Returns:
@@ -73,8 +73,8 @@ class PreparedTemplate:
         """The part of the motion that is input to template and network; here all of it."""
         return motion
 
-    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The part of a displacement by an impulse that its frame does not reach (:meth:`ModalScene.withheld`).
+    def overshoot(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The part of a displacement by an impulse that its frame does not reach (:meth:`ModalScene.overshoot`).
 
         Raises:
             NotImplementedError: the template has no energy.
@@ -189,7 +189,7 @@ class PreparedScenes(PreparedTemplate):
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return motion.rest + moved[:, :3], deformation
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+    def compliance(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member yields to impulses: by the modes of its scene."""
         part = next(part for part, _, members in self.parts if member in members)
         modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
@@ -205,9 +205,9 @@ class PreparedScenes(PreparedTemplate):
         seen = made[0] if len(made) == 1 else torch.cat(made, 1).index_select(1, self._places)
         return replace(motion, now=motion.rest + seen[0], before=motion.rest + seen[1])
 
-    def withheld(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def overshoot(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The part of a displacement by an impulse that its frame does not reach, scene by scene."""
-        parts = [part.withheld(self._members_of(displacement, rows, members)) for part, rows, members in self.parts]
+        parts = [part.overshoot(self._members_of(displacement, rows, members)) for part, rows, members in self.parts]
         return self._in_order([made.flatten(0, 1) for made in parts])
 
     def _in_order(self, made: list[Tensor]) -> Tensor:
