@@ -36,15 +36,13 @@ OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
-GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol", "model_for_data")
+GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol")
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
 def compose_option(option: str) -> DictConfig:
     group, name = option_of(conf_dir() / f"{option}.yaml")
     overrides = [f"{group}={name}"]
-    if group == "model_for_data":
-        overrides = [f"{key}={value}" for key, value in zip(("model", "data"), name.rsplit("_", 1), strict=True)]
     return compose("train", [*overrides, *(["model=gausim"] if group == "ablation" else [])])
 
 

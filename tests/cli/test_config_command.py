@@ -179,7 +179,7 @@ def test_what_is_no_configuration(what: list[str], message: str, tmp_path, monke
         ("prepare lpips --f", {"--from"}),
         ("train --mu", {"--multirun"}),
         ("train model=gausim_", {"model=gausim_elastic", "model=gausim_paper"}),
-        ("train mod", {"model=", "model.", "model_for_data="}),
+        ("train mod", {"model=", "model."}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
         ("train model=gausim model.simulator.template.perio", {"model.simulator.template.period="}),
         ("train loss.image.win", {"loss.image.window="}),  # which no configuration lists

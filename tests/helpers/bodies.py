@@ -63,9 +63,9 @@ def make_model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0
     return model.eval()
 
 
-def neural_model(**options):
+def neural_model(*, law: str = "solid", **options):
     """A small model=gausim in double precision."""
-    return make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
+    return make_model(replace(make_scene(90, dtype=torch.float64), law=law), **(NEURAL | options))
 
 
 def make_state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimState:

@@ -142,4 +142,4 @@ def _entry(root: Path, trained: ObjectData) -> dict[str, Any]:
     paths = {"root": root, "scene": trained.scene_path, "masks": trained.masks_path}
     placed = {key: None if path is None else str(Path(path).resolve()) for key, path in paths.items()}
     test = trained.test if Path(root).resolve() == trained.root.resolve() else None  # it names sequences of that store
-    return {**placed, "selections": trained.selections or None, "test": test}
+    return {**placed, "selections": trained.selections or None, "law": trained.law, "test": test}

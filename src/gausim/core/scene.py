@@ -14,6 +14,9 @@ from gausim.core.surroundings import Surroundings
 SH_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 
 
+LAWS = ("solid", "springs")
+
+
 @dataclass(frozen=True, eq=False)
 class GaussianScene:
     """K Gaussians exactly as a 3DGS file stores them (raw parameters, neither activated nor normalised)."""
@@ -32,6 +35,9 @@ class GaussianScene:
     surroundings: Surroundings = field(default_factory=Surroundings)  # what acts on the body besides its own elasticity
     # the hand that holds each pinned kernel, -1 for those that nobody moves; None: there are no hands
     hand: Int[Tensor, " K"] | None = None
+    law: str = (
+        "solid"  # of large deformations: ``solid``, finite strain of a solid body, or ``springs``, a net of springs
+    )
 
     @staticmethod
     def create(

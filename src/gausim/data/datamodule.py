@@ -38,6 +38,7 @@ class ReadyDataModule(LightningDataModule):
         scene: str | Path | None = None,
         masks: str | Path | None = None,
         selections: Mapping[str, Selection | str] | None = None,
+        law: str = "solid",
         plan: Shows | None = None,
         seed: int = 0,
         prefetch: int = 0,
@@ -49,10 +50,11 @@ class ReadyDataModule(LightningDataModule):
 
         Args:
             root: an object directory, a folder of such, or a list of either; an entry of the list may be a mapping
-                with ``root`` and separate ``scene``, ``masks``, ``selections`` and ``test``.
+                with ``root`` and separate ``scene``, ``masks``, ``selections``, ``law`` and ``test``.
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
+            law: of large deformations: ``solid``, or ``springs`` for a net of springs.
             plan: the resolved training plan, or its part that data follow.
             seed: seed of the training order.
             prefetch: number of batches that a process of its own reads ahead; 0 reads each when it is asked for.
@@ -63,7 +65,9 @@ class ReadyDataModule(LightningDataModule):
         """
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
-        self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections, "test": test}
+        self._options: dict[str, Any] = {
+            "scene": scene, "masks": masks, "selections": selections, "law": law, "test": test,
+        }  # fmt: skip
         self.sealed = True
         self.plan, self._seed, self._prefetch = plan, seed, prefetch
         self._sampler: SequenceBatchSampler | None = None

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 from torch import Tensor
 
 from gausim.core import ConfigError, DataError, GaussianScene
+from gausim.core.scene import LAWS
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_stills
 from gausim.data.surroundings import gripped, read_surroundings
 from gausim.io.npz import read_array
@@ -86,7 +87,7 @@ class ObjectData:
         facts: all other entries of ``dataset.json``.
         surroundings: what acts on the body besides its own elasticity.
         scene_path, masks_path: files of the rest scene and its masks; without the second the one beside the PLY.
-        selections, test, sealed: as given.
+        selections, law, test, sealed: as given.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class ObjectData:
         scene: Path | str | None = None,
         masks: Path | str | None = None,
         selections: Mapping[str, Selection | str] | None = None,
+        law: str = "solid",
         test: Mapping[str, Any] | None = None,
         sealed: bool = False,
     ) -> None:
@@ -108,12 +110,17 @@ class ObjectData:
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
+            law: its law of large deformations (:class:`gausim.core.GaussianScene`).
             test: the test part, in addition to that of ``dataset.json`` (:class:`gausim.data.objects.ReservedPart`).
             sealed: refuse unseen frames and the true motion of the test part.
 
         Raises:
+            ConfigError: the law is unknown.
             DataError: ``dataset.json`` is missing or has a wrong field.
         """
+        if law not in LAWS:
+            raise ConfigError(f"data.law is '{law}'; expected one of {', '.join(LAWS)}.")
+        self.law = law
         self.root = Path(root)
         path = self.root / "dataset.json"
         self.facts = read_json(path)
@@ -211,7 +218,7 @@ class ObjectData:
                 "or name one in the data config (scene: path/to/scene.ply)."
             )
         scene = load_scene(self.scene_path, masks=self.masks_path, name=self.name)
-        scene = replace(select_masks(scene, self.selections), surroundings=self.surroundings)
+        scene = replace(select_masks(scene, self.selections), surroundings=self.surroundings, law=self.law)
         first = self.sequences[0] if (self.root / "sequences").is_dir() else None
         if first is not None and first.holds is not None:
             scene = gripped(scene, *first.holds, self._grip, str(self.root / "dataset.json"))

@@ -43,6 +43,7 @@ class Hierarchy:
     levels: tuple[Level, ...]  # the levels, kernels first
     kernels: Int[Tensor, " K"]  # scene index of each level-0 unit
     diagonal: float  # bounding-box diagonal of the simulated kernels [scene units]; see :func:`build_hierarchy`
+    law: str = "solid"  # of the scene
 
     def ancestor(self, fine: int, coarse: int) -> Int[Tensor, " N"]:
         """The unit of level ``coarse`` that contains each unit of level ``fine``."""
@@ -101,7 +102,7 @@ def build_hierarchy(
         if not top:
             rest, volume, group = _coarsen(rest, volume, group, parent)
             pinned = group > 0
-    return Hierarchy(tuple(levels), index, diagonal)
+    return Hierarchy(tuple(levels), index, diagonal, scene.law)
 
 
 def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float, clustering: str) -> Tensor:

@@ -75,7 +75,7 @@ class MaterialDynamics(SceneDynamics):
         """
         changed, template = self._given.clone(), cast(MaterialTemplate, self.model.template)
         changed[:, 0] += math.log(stiffness)
-        if template.has_drag:
+        if template.has_drag(self.scene_id):
             changed[:, 1] += math.log(damping)
         else:
             template.viscosity_scale[self.scene_id] = damping

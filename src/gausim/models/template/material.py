@@ -20,7 +20,7 @@ k, c_0 and c_1 are trained numbers common to all scenes. In a step of the trapez
 amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the first part of the factor
 of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and strong drag would turn the
 velocity round instead of stopping it. What is nonlinear are either the cells of the units, with e^{s_i} and e^{b_i}
-(finite strain, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (springs,
+(law ``solid``, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (law ``springs``,
 :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
 the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
 common (:class:`gausim.models.template.modal.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
@@ -82,11 +82,10 @@ class Links:
 
 @dataclass(frozen=True)
 class Damping:
-    """Damping at the beginning."""
+    """Damping of solid bodies at the beginning; that of nets of springs is not trained."""
 
-    drag: float = 0.0015  # c_0 [1 / frame]; 0: none, whatever is trained
+    drag: float = 0.0015  # c_0 [1 / frame]; 0: none, whatever is trained; a net of springs has none
     viscosity: float = 0.0015  # c_1 [frames]
-    trained: bool = True  # both; else they stay as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,6 @@ class MaterialTemplate(Template):
         modes: int = 48,
         solid: SolidSettings = DEFAULT_SOLID,
         links: Links = Links(),
-        law: str = "solid",
         own_matrices: bool = False,
         hidden: int = 48,
         period: float = 8.0,
@@ -141,7 +139,6 @@ class MaterialTemplate(Template):
             modes: number of modes.
             solid: the solid body.
             links: links between units.
-            law: what is nonlinear: ``solid``, the finite strain of the body's cells, or ``springs``, further links.
             own_matrices: also train factors on the decoded matrices of each scene, so that its modes may mix.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
@@ -149,35 +146,38 @@ class MaterialTemplate(Template):
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
-            ConfigError: fewer than two attributes, an unknown law, or a damping that is negative.
+            ConfigError: fewer than two attributes, or a damping that is negative.
         """
         super().__init__()
-        if law not in SPRINGS_OF_LAW:
-            raise ConfigError(f"model.simulator.template.law is '{law}'; expected solid or springs.")
         if attributes < 2:
             raise ConfigError(
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
         self.conserve_volume = conserve_volume
-        self.links, self.solid, self.springs = links, solid, SPRINGS_OF_LAW[law]
-        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours, finite=law == "solid")
+        self.links, self.solid, self.laws = links, solid, [h.law for h in hierarchies]
+        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours)
         counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
-            made(h, frame=f, modes=count) for h, f, count in zip(hierarchies, frames, counts, strict=True)
+            made(h, frame=f, modes=count, finite=h.law == "solid")
+            for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )
         own = [OwnMatrices(self.body(i).modes.shape[-1]) for i in range(len(hierarchies))] if own_matrices else []
         self.scenes = nn.ModuleList(own)
         if damping.drag < 0 or damping.viscosity <= 0:
             raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
         self.log_k = 2 * math.log(2 * math.pi / period)
-        self.initial, self.has_drag = damping, damping.drag > 0
-        logs = [self.log_drag if self.has_drag else -math.inf, math.log(damping.viscosity)]
+        self.initial = damping
+        logs = [math.log(damping.drag) if damping.drag else -math.inf, math.log(damping.viscosity)]
         self.register_buffer("log_damping", torch.tensor(logs), persistent=False)
         self.viscosity_scale: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
         self.stiffness = nn.Parameter(torch.zeros(()))
-        self.damping = nn.Parameter(torch.zeros(2), requires_grad=damping.trained)
+        self.damping = nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
+
+    def has_drag(self, scene_id: int) -> bool:
+        """Whether a scene has drag, which the second attribute changes."""
+        return self.initial.drag > 0 and self.laws[scene_id] == "solid"
 
     @property
     def log_drag(self) -> float:
@@ -186,7 +186,7 @@ class MaterialTemplate(Template):
         Raises:
             ConfigError: there is no drag.
         """
-        if not self.has_drag:
+        if not self.initial.drag:
             raise ConfigError("model.simulator.template.damping.drag is 0: no attribute can set the damping of a body.")
         return math.log(self.initial.drag)
 
@@ -212,8 +212,16 @@ class MaterialTemplate(Template):
         return own + _saturated(units), between + _saturated(links)
 
     def _damping(self, scene_id: int) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """c_0 and c_1 of a scene [1 / frame, frames]."""
-        drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+        """c_0 and c_1 of a scene [1 / frame, frames].
+
+        A net of springs has no drag, and c_1 as given: a fit would take its errors of phase for damping, since a motion
+        out of step is nearest when it is small.
+        """
+        if self.laws[scene_id] == "solid":
+            drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+        else:
+            viscosity = cast(Tensor, self.log_damping)[1].exp()
+            drag = torch.zeros_like(viscosity)
         return drag, viscosity * self.viscosity_scale.get(scene_id, 1.0)
 
     def matrices(
@@ -224,7 +232,8 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = self._damping(scene_id)
-        springs = self.springs * links[:, 2].exp()
+        strength = SPRINGS_OF_LAW[self.laws[scene_id]]
+        springs = strength * links[:, 2].exp()
         stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
         cells = units[:, :2].exp()
         stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness) + body.stretch.mT @ stretch
@@ -239,7 +248,7 @@ class MaterialTemplate(Template):
         if body.cells is not None:
             slowed = (stiffness.diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
             inertia, damping = mass + slowed, damping + rate * slowed
-        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - self.springs)
+        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - strength)
         return Matrices(
             stiffness, mass, mass - even, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
             tense, self.links.damping / frame,
@@ -254,17 +263,18 @@ class MaterialTemplate(Template):
         body = self.body(scene_id)
         decoded, links = self.decode(body, units.attributes)
         parts = body.stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)  # of shear and volume (2, N)
-        factors = self.links.linear * links[:, 0].exp() + self.springs * links[:, 2].exp()
+        strength = SPRINGS_OF_LAW[self.laws[scene_id]]
+        factors = self.links.linear * links[:, 0].exp() + strength * links[:, 2].exp()
         size = 0.5 * body.stretch.square().sum(-1)
         own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
         for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
-            homogeneous = homogeneous.index_add(0, end, (self.links.linear + self.springs) * size)
+            homogeneous = homogeneous.index_add(0, end, (self.links.linear + strength) * size)
         found = {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
-        if self.has_drag:
+        if self.has_drag(scene_id):
             drag = REFERENCE_FPS * self._damping(scene_id)[0] * decoded[:, 2].exp()
             found["damping"] = Property(drag, "drag over momentum [1/s]")
         return found
