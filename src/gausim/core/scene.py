@@ -35,9 +35,8 @@ class GaussianScene:
     surroundings: Surroundings = field(default_factory=Surroundings)  # what acts on the body besides its own elasticity
     # the hand that holds each pinned kernel, -1 for those that nobody moves; None: there are no hands
     hand: Int[Tensor, " K"] | None = None
-    law: str = (
-        "solid"  # of large deformations: ``solid``, finite strain of a solid body, or ``springs``, a net of springs
-    )
+    # law of large deformations, one of :data:`LAWS`: finite strain of a solid body, or a net of springs
+    law: str = "solid"
 
     @staticmethod
     def create(
