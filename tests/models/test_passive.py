@@ -32,9 +32,9 @@ def _energies(model: GausSim, positions: torch.Tensor) -> list[float]:
 def test_energy_grows_without_the_guard_and_not_with_it() -> None:
     scene = make_scene()
     state = SimState(scene.means, make_state(scene).positions)
-    found, model = {}, _model(scene)
+    found, model = {}, _model(scene, scale=0.07)
     for frames in (0, FRAMES):
-        rollout = SceneDynamics(_model(scene, frames=frames)).rollout(state, 70)
+        rollout = SceneDynamics(_model(scene, frames=frames, scale=0.07)).rollout(state, 70)
         positions = torch.cat((state.previous[None], rollout.positions))
         found[frames] = _energies(model, positions)
     assert max(found[0][FRAMES:]) > 1.2 * max(found[0][:FRAMES])
