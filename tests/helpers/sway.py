@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gausim.core import GaussianScene, Rendered, SimState
+from gausim.core import Frame, GaussianScene, Rendered, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
@@ -53,7 +53,7 @@ class Sway(nn.Module):
 
     def step(
         self, batch: SimpleNamespace, state: SimState, force: Tensor | None = None, prepared: None = None
-    ) -> SimpleNamespace:
+    ) -> Frame:
         drift = torch.cat([self.drift[m.scene_id].expand(m.kernels.stop - m.kernels.start) for m in batch.members])
         push = torch.zeros_like(batch.rest)
         push[:, 0] = drift * batch.rest[:, 2] ** 2
@@ -62,9 +62,7 @@ class Sway(nn.Module):
             positions = positions * self.poison
         identity = torch.eye(3, device=positions.device).expand(len(batch.members), 3, 3)
         momentum = (self.keep * drift.mean()).square()
-        return SimpleNamespace(
-            positions=positions, deformation_gradients=identity, rotations=identity, momentum=momentum
-        )
+        return Frame(positions, identity, identity, momentum=momentum)
 
 
 class Previous(nn.Module):

@@ -11,7 +11,7 @@ import torch
 from helpers import sway
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, SimState
+from gausim.core import ConfigError, Frame, SimState
 from gausim.losses.objective import EnergyLoss, Objective
 from gausim.models.template.template import RestTemplate, Template
 from gausim.training.graphed import GraphedRollouts
@@ -37,7 +37,8 @@ class Spiral(nn.Module):
     def step(self, batch: SimpleNamespace, state: SimState, force: object = None, prepared: object = None) -> object:
         factor = self.factor.repeat_interleave(2)[:, None]
         positions = batch.rest + factor * (state.positions - batch.rest)
-        return SimpleNamespace(positions=positions, deformation_gradients=None, rotations=None, momentum=None)
+        identity = torch.eye(3).expand(2, 3, 3)
+        return Frame(positions, identity, identity)
 
     def energy(self, batch: SimpleNamespace, state: SimState, prepared: object = None) -> Tensor:
         self.sizes.append(float((state.positions - batch.rest).abs().max()))
