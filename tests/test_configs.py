@@ -134,25 +134,6 @@ def test_settings_that_no_configuration_lists_are_the_constructors_defaults() ->
         assert defaults and all((list(d) if isinstance(d, tuple) else d) == value for d in defaults), key
 
 
-def test_settings_that_no_configuration_lists_are_the_constructors_defaults() -> None:
-    root = read_places()
-    for key, value in more_settings().items():
-        *parents, name = key.split(".")
-        place = functools.reduce(lambda node, part: node.children[part], parents, root)
-        takers = [inspect.signature(hydra.utils.get_object(target)).parameters for target in place.targets]
-        defaults = [parameters[name].default for parameters in takers if name in parameters]
-        assert defaults and all((list(d) if isinstance(d, tuple) else d) == value for d in defaults), key
-
-
-def test_a_model_has_its_settings_for_a_data_set_which_an_ablation_may_change() -> None:
-    def levels(*overrides: str) -> list[float]:
-        return [level.diameter for level in compose("train", list(overrides)).model.simulator.hierarchy.levels]
-
-    assert levels("model=gausim") == [0.4, 0.09]
-    assert levels("model=gausim", "protocol=bunny_development") == [0.4, 0.13]
-    assert levels("experiment=bunny", "model=gausim", "ablation=no_hierarchy") == [0.0]
-
-
 def test_settings_that_no_configuration_lists_are_set_like_others(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(leaves(compose("train"))) <= 90
     config = compose("train", ["trainer.progress=false", "loss.image.window=7", "trainer.overwrite=true"])

@@ -98,64 +98,6 @@ def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
 
 
-def _own(template: MaterialTemplate, *, size: float) -> None:
-    """Trains the own matrices of scene 0, at random."""
-    generator = torch.Generator().manual_seed(6)
-    for weight in template.scenes[0].parameters():
-        weight.copy_(size * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
-
-
-def test_own_matrices_are_factors_on_the_decoded_ones(hierarchy) -> None:
-    decoded = _template(hierarchy).matrices(0, *_material(hierarchy), 1 / 24)
-    template, material = _template(hierarchy, own_matrices=True), _material(hierarchy)
-    found = template.matrices(0, *material, 1 / 24)
-    for name in ("stiffness", "mass", "inertia", "damping"):
-        torch.testing.assert_close(getattr(found, name), getattr(decoded, name))
-    assert float(template.mixing(0)) == 0
-    _own(template, size=1.0)
-    found, own = template.matrices(0, *material, 1 / 24), template.scenes[0]
-    eye = torch.eye(9, dtype=torch.float64)
-    heavy, mixed = eye + 0.3 * own.inertia_mixing, eye + 0.3 * own.stiffness_mixing
-    root = torch.linalg.cholesky(decoded.stiffness)
-    inner = root @ mixed @ (2 * own.stiffness).exp().diag() @ mixed.mT @ root.mT
-    torch.testing.assert_close(found.stiffness, heavy.mT @ inner @ heavy)
-    torch.testing.assert_close(found.mass, heavy.mT @ decoded.mass @ heavy)
-    for matrix in (found.stiffness, found.mass, found.inertia, found.damping):
-        least = torch.linalg.eigvalsh(matrix)
-        assert float(least[0]) > -1e-9 * float(least[-1])
-    mixings = (own.stiffness_mixing, own.damping_mixing, own.inertia_mixing)
-    assert float(template.mixing(0)) == pytest.approx(sum(float((0.3 * m).square().sum()) for m in mixings))
-
-
-@pytest.mark.parametrize("law", ["solid", "springs"])
-def test_a_step_of_own_matrices_adds_no_energy_and_trains_them(hierarchy, law: str) -> None:
-    template = _template(replace(hierarchy, law=law), own_matrices=True)
-    _own(template, size=0.2)
-    template.requires_grad_(True)
-    part = PreparedMaterial(template.body(0), template.matrices(0, *_material(hierarchy), 1 / 24), 1.0)
-    part.corrections = 30
-    now = 0.02 * torch.randn(1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    before, energies = now, []
-    for _ in range(20):
-        energies.append(float(part.energy(now, before).detach()))
-        now, before = part.after(now, before), now
-    assert max(energies) <= energies[0] * (1 + 1e-6) and energies[-1] < energies[0]
-    now.square().sum().backward()
-    for name, weight in template.scenes[0].named_parameters():
-        assert torch.isfinite(weight.grad).all() and weight.grad.any(), name
-
-
-def test_own_matrices_belong_to_their_scene() -> None:
-    template = partial(NEURAL["template"], own_matrices=True)
-    model = make_model([make_scene(90), make_scene(90, seed=1)], **(NEURAL | {"template": template}))
-    assert model.own(1)[-1] == "template.scenes.1." and not any("scenes" in name for name in model.shared())
-    groups = model.parameter_groups()
-    assert len(groups["matrices"]) == 10 and sum(map(len, groups.values())) == len(list(model.parameters()))
-    model.freeze()
-    assert all(p.requires_grad for p in groups["matrices"]) and not any(p.requires_grad for p in groups["template"])
-    assert {"network", "template"} == set(model.shared_groups)
-
-
 def test_without_drag_training_adds_none(hierarchy) -> None:
     template, (density, attributes) = _template(hierarchy, damping=Damping(0.0, 0.02)), _material(hierarchy)
     template.requires_grad_(True)

@@ -29,7 +29,6 @@ class OptimizerSettings:
     network_lr: float = 8e-4
     scene_lr: float = 8e-4
     template_lr: float | None = None
-    matrices_lr: float | None = None
     initial_lr: float = 8e-4
     clip_norm: float = 1.0
     clip_per_group: bool = False
@@ -51,8 +50,7 @@ class OptimizerSettings:
         A parameter that a batch does not use has no loss gradient, and the optimiser skips it and its momentum.
         """
         template = self.scene_lr if self.template_lr is None else self.template_lr
-        matrices = template if self.matrices_lr is None else self.matrices_lr
-        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, matrices, self.initial_lr), strict=True))
+        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, template, self.initial_lr), strict=True))
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
             parts: dict[float, list[Parameter]] = {0.0: []}  # parameters without decay come first

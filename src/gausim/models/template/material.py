@@ -50,7 +50,6 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.body_modes import BodyModes
 from gausim.models.template.modal import ModalScene, force_of_strain
-from gausim.models.template.own_matrices import OwnMatrices
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.template import DENSITY, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
@@ -94,7 +93,6 @@ class Matrices:
 
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     mass: Float[Tensor, "M M"]  # M (M, M)
-    heavier: Float[Tensor, "M M"]  # M less that of the units and links
     inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
@@ -123,7 +121,6 @@ class MaterialTemplate(Template):
         modes: int = 48,
         solid: SolidSettings = DEFAULT_SOLID,
         links: Links = Links(),
-        own_matrices: bool = False,
         hidden: int = 48,
         period: float = 8.0,
         damping: Damping = Damping(),
@@ -139,7 +136,6 @@ class MaterialTemplate(Template):
             modes: number of modes.
             solid: the solid body.
             links: links between units.
-            own_matrices: also train factors on the decoded matrices of each scene, so that its modes may mix.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1.
@@ -161,8 +157,6 @@ class MaterialTemplate(Template):
             made(h, frame=f, modes=count, finite=h.law == "solid")
             for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )
-        own = [OwnMatrices(self.body(i).modes.shape[-1]) for i in range(len(hierarchies))] if own_matrices else []
-        self.scenes = nn.ModuleList(own)
         if damping.drag < 0 or damping.viscosity <= 0:
             raise ConfigError(f"model.simulator.template.damping: {damping}; expected drag >= 0 and viscosity > 0.")
         self.log_k = 2 * math.log(2 * math.pi / period)
@@ -241,16 +235,13 @@ class MaterialTemplate(Template):
         inertia, dragged = _inertia(body, density, between, (drag * frame * units[:, 2].exp()).div(2).tanh())
         rate = _trace(dragged) / _trace(inertia)
         stiffness = k * stiffness
-        even, mass, damping = inertia, inertia, dragged + (rate / 4 + viscosity / frame) * stiffness
-        if self.scenes:
-            stiffness, mass, damping = self.scenes[scene_id](stiffness, mass, damping)
-        inertia = mass
+        mass, damping = inertia, dragged + (rate / 4 + viscosity / frame) * stiffness
         if body.cells is not None:
             slowed = (stiffness.diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
             inertia, damping = mass + slowed, damping + rate * slowed
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - strength)
         return Matrices(
-            stiffness, mass, mass - even, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
+            stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
             tense, self.links.damping / frame,
         )  # fmt: skip
 
@@ -289,17 +280,9 @@ class MaterialTemplate(Template):
         squared = torch.linalg.eigvalsh(root @ found.stiffness @ root.mT)[0]
         return 2 * math.pi / math.sqrt(float(squared)) / REFERENCE_FPS
 
-    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """Squared Frobenius norm of the mode mixing of a scene's own matrices."""
-        return cast(OwnMatrices, self.scenes[scene_id]).mixing_size() if self.scenes else None
-
     def shared(self, prefix: str) -> tuple[str, ...]:
         """Prefixes of the names of the decoders, of k and of the dampings."""
         return tuple(prefix + name for name in ("stiffness", "damping", "unit_decoder.", "link_decoder."))
-
-    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
-        """Prefix of the names of a scene's own matrices."""
-        return (f"{prefix}scenes.{scene_id}.",) if self.scenes else ()
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
@@ -371,7 +354,6 @@ class PreparedMaterial(ModalScene):
         tied = self.body.tie * self.matrices.between[:, None] * (second - first)
         own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
         own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
-        own = own + (acceleration.flatten(1) @ self.projection) @ self.matrices.heavier
         own = own + self.body.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
