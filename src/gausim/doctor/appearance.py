@@ -32,7 +32,6 @@ def find_plain(evidence: Evidence) -> Iterator[Finding]:
             f"The object is plain: its colours change by {np.median(slopes):.1f} of 255 per pixel, so only its outline "
             "tells how it moves.",
             "Training works from outlines too, less exactly. A pattern (paint, stickers, printed cloth) helps.",
-            {"slope": float(np.median(slopes))},
         )  # fmt: skip
 
 
@@ -55,7 +54,6 @@ def find_flicker(evidence: Evidence) -> Iterator[Finding]:
             f"The brightness of {listed(flickers)} jumps from frame to frame (by more than {_FLICKER:.0%} in "
             f"{max(fractions.values()):.0%} of the frames): automatic exposure, or lamps on mains.",
             "Film with fixed exposure, at a shutter time that suits the mains (1/50 or 1/100 s at 50 Hz).",
-            {"fraction": fractions},
         )  # fmt: skip
 
 
@@ -76,5 +74,4 @@ def find_uneven(evidence: Evidence) -> Iterator[Finding]:
             "warning", "likely",
             f"Brightness differs between cameras, compared with the rest scene: {told}.",
             "Set exposure and white balance alike and fixed, or correct the pictures of this camera.",
-            {"gain": gains},
         )  # fmt: skip

@@ -60,45 +60,40 @@ def _consistent_shift(fits: Sequence[Fit]) -> float:
 
 
 def _moved(evidence: Evidence, fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
-    longer, scale = max(evidence.first[0].alpha.shape[-2:]), evidence.scale
+    longer = max(evidence.first[0].alpha.shape[-2:])
     off = {view: _consistent_shift(row) for view, row in fits.items()}
     worth = [view for view, pixels in off.items() if pixels > _WORTH * longer]
     if not worth:
         return
-    told = "; ".join(_sentence(view, fits[view], scale) for view in worth)
+    measured = "; ".join(_sentence(view, fits[view], evidence.scale) for view in worth)
     if 2 * len(worth) < len(off):
-        rest = max(pixels for view, pixels in off.items() if view not in worth) / scale
-        are, them = ("is", "it") if len(worth) == 1 else ("are", "them")
         what = (
-            f"{listed(worth)} {are} not where the pose says, while the others agree with the rest scene to "
-            f"{max(rest, 0.1):.1f} pixels: {told}."
+            f"{listed(worth)} {'is' if len(worth) == 1 else 'are'} not where the pose says, while the others agree "
+            f"with the rest scene: {measured}."
         )
         remedy = (
-            f"Find the pose of {listed(worth)} again (was it moved after the calibration?), or take {them} out of "
+            f"Find the pose of {listed(worth)} again (was it moved after the calibration?), or take it out of "
             "dataset.json."
         )
     else:
-        what = f"{len(worth)} of {len(off)} cameras disagree with the rest scene: {told}."
+        what = f"{len(worth)} of {len(off)} cameras disagree with the rest scene: {measured}."
         remedy = (
             "Calibrate all cameras together with the stills that the scene was made of (`gausim prepare poses "
             "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
         )
     spoils = max(off[view] for view in worth) > _SPOILS * longer
     sure = spoils and min(fit.aligned for row in fits.values() for fit in row) > _SHAPE
-    measured = {"views": worth, "pixels": {view: pixels / scale for view, pixels in off.items()}}
-    yield Finding("fault" if spoils else "warning", "certain" if sure else "likely", what, remedy, measured)
+    yield Finding("fault" if spoils else "warning", "certain" if sure else "likely", what, remedy, tuple(worth))
 
 
 def _sentence(view: str, fits: Sequence[Fit], scale: float) -> str:
-    if not math.isfinite(np.median([fit.pixels for fit in fits])):
-        return f"the rest scene is outside the picture of {view}"
     pixels, degrees = (float(np.median([getattr(fit, key) for fit in fits])) for key in ("pixels", "degrees"))
+    if not math.isfinite(pixels):
+        return f"the rest scene is outside the picture of {view}"
     right, down = np.median([fit.shift for fit in fits], axis=0) / scale
-    turn = float(np.median([fit.turn for fit in fits]))
     return (
-        f"{view} is off by about {degrees:.1f} degrees or {pixels / scale:.1f} pixels "
-        f"(the scene lies {abs(right):.1f} {'right' if right > 0 else 'left'} and "
-        f"{abs(down):.1f} {'below' if down > 0 else 'above'}, turned by {abs(turn):.1f} degrees)"
+        f"{view} is off by about {degrees:.1f} degrees or {pixels / scale:.1f} pixels (the scene lies {right:.1f} to "
+        f"the right and {down:.1f} below)"
     )
 
 
@@ -112,7 +107,6 @@ def _shape(fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
             "are missing in the scene, or frame 0 shows another shape.",
             "Look at views.png (--out DIR). Reconstruct the scene again, or check the masks and that sequences begin "
             "at rest.",
-            {"aligned": aligned},
         )  # fmt: skip
 
 
@@ -122,22 +116,18 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
     readings = _readings(evidence.scene, item.alpha[0] / np.float32(255), item.cameras)
     best, now = readings[0], float(np.mean(list(raw.values())))
     fits = best.overlap > max(_FITS, now + 0.2)
-    if fits:
-        what = f"The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}."
-        remedy = f"In every sequences/*/transforms.json {best.remedy}."
-    else:
-        what = (
-            f"No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
-            f"{best.overlap:.2f})."
-        )
+    what = f"The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}."
+    remedy = f"In every sequences/*/transforms.json {best.remedy}."
+    if not fits:
+        what = f"No usual mistake explains it (best: {best.name}, overlap {best.overlap:.2f})."
         remedy = (
-            "Check that scene and sequences are of one object and one world, and that angles in degrees were turned "
-            "into radians; calibrate the cameras again (`gausim prepare poses`)."
+            "Check that scene and sequences are of one object and one world, and that angles are in radian; calibrate "
+            "the cameras again (`gausim prepare poses`)."
         )
     return Finding(
         "fault", "certain" if fits else "likely",
         f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f}). {what}",
-        remedy, {"overlap": raw, "readings": {r.name: r.overlap for r in readings}},
+        remedy,
     )  # fmt: skip
 
 

@@ -56,7 +56,7 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "note", "possible",
             f"Whether {view} is in step with the other cameras cannot be told: its motion over time is unlike theirs.",
-            "Compare it by eye in motion.png (--out DIR).", {"view": view},
+            "Compare it by eye in motion.png (--out DIR).", (view,),
         )  # fmt: skip
     if any(lags.values()):
         yield from _findings(evidence, lags, guessed, [s.name for s in series])
@@ -183,6 +183,5 @@ def _findings(evidence: Evidence, lags: dict[int, int], guessed: set[int], seque
             f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
             f"{place}.",
             f"Number the frames again: {cut}, and cut all cameras to one length. With films: `gausim "
-            "prepare ingest` with sound, a flash or `--offsets`.",
-            {"view": view, "late_by_frames": lag, "sequences": sequences},
+            "prepare ingest` with sound, a flash or `--offsets`.", (view,),
         )  # fmt: skip

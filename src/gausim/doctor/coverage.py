@@ -58,17 +58,13 @@ def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "fault", "certain",
             f"There is one training view only ({names[0]}): motion towards it and away from it is not seen.",
-            "Film with at least two cameras, better four, 40 degrees or more apart, or move a held-out view to "
-            "'train_views' of dataset.json.",
-            {"views": 1, "angle": angle},
+            "Film with at least two cameras, better four, 40 degrees or more apart.",
         )  # fmt: skip
     elif angle < _NARROW:
         yield Finding(
             "fault" if angle < _SAME else "warning", "certain",
             f"The training views {listed(names)} look along nearly the same line ({angle:.0f} degrees): depth is "
-            f"{'not seen' if angle < _SAME else 'hardly seen'}.",
-            "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
-            {"views": len(names), "angle": angle},
+            "hardly seen.", "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
         )  # fmt: skip
 
 
@@ -87,7 +83,6 @@ def find_cut_off(evidence: Evidence) -> Iterator[Finding]:
             f"The object is cut off at the {listed(cut)} of {view} in {max(often.values()):.0%} of the frames"
             f"{'' if moves else ', where nothing moves'}.",
             "Move the camera back or turn it. Where only a part that is held leaves the picture, this does no harm.",
-            {"view": view, "fraction": often},
         )  # fmt: skip
 
 
@@ -108,7 +103,6 @@ def find_tiny(evidence: Evidence) -> Iterator[Finding]:
                 f"The object is tiny in {view}: {length / evidence.scale:.0f} pixels, {length / longer:.0%} of the "
                 "picture's longer side.",
                 "Film from nearer or with a longer lens, or crop the pictures (and shift cx, cy, w and h with them).",
-                {"view": view, "pixels": length / evidence.scale},
             )  # fmt: skip
 
 
@@ -124,7 +118,6 @@ def find_pins(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "fault", "certain", f"{sentence.rstrip('.')}.",
             remedy or "Pin fewer kernels, e.g. --pin \"below z=...\" with a lower height.",
-            {"pinned": int(scene.pinned.sum()), "simulated": int(scene.simulated.sum())},
         )  # fmt: skip
         return
     fraction = float(scene.pinned.sum()) / float(scene.simulated.sum())
@@ -133,31 +126,22 @@ def find_pins(evidence: Evidence) -> Iterator[Finding]:
             "warning", "possible",
             f"{fraction:.0%} of the simulated kernels are pinned: hardly anything is left to move.",
             "Pin only what is held in the videos (`gausim inspect SCENE.ply` draws it in grey).",
-            {"fraction": fraction},
         )  # fmt: skip
 
 
 def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
-    """Finds objects with too few training frames for an oscillation."""
-    seen = len(evidence.data.train_frames)
+    """Finds objects with too few training frames for an oscillation, or too few sequences for several directions."""
+    seen, sequences = len(evidence.data.train_frames), evidence.sequences
     if seen < _SEEN:
         yield Finding(
             "warning", "likely" if seen < _FEWEST_SEEN else "possible",
             f"Training sees {seen} frames of each sequence only (field 'train_frames' of dataset.json); the paper sees "
             f"{_SEEN}. Less than a swing says little about stiffness and damping.",
             f"Record longer sequences, or set 'train_frames' to [0, {_SEEN}].",
-            {"frames": seen},
         )  # fmt: skip
-
-
-def find_few_sequences(evidence: Evidence) -> Iterator[Finding]:
-    """Finds objects with too few sequences for several directions of motion."""
-    sequences = evidence.sequences
     if sequences < _SEQUENCES:
         yield Finding(
             "warning", "possible",
-            f"There {'is one sequence' if sequences == 1 else f'are {sequences} sequences'} only: pushes in directions "
-            "that were never filmed will be predicted badly.",
-            "Record more, pushed at different places and in different directions (the paper has 30, the examples 8 to "
-            "12).", {"sequences": sequences},
+            f"Sequences: {sequences} only. Pushes in directions that were never filmed will be predicted badly.",
+            "Record more, pushed at different places and in different directions (the paper has 30).",
         )  # fmt: skip

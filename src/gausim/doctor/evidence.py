@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -38,7 +37,7 @@ class Finding:
     sureness: Sureness  # certainty of the finding
     what: str  # the problem, in a sentence that names cameras, sequences and files
     remedy: str  # what to do
-    measured: Mapping[str, Any] = field(default_factory=dict)  # measured values, for programs
+    views: tuple[str, ...] = ()  # cameras that a fault of calibration or clock is about
     check: str = ""  # the check that found it, which :func:`gausim.doctor.examine.examine` fills in
 
 
@@ -124,7 +123,8 @@ def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
         # A new record, because those of data.sequences keep all decoded images.
         record = data.record(name)
         frames = min(record.visible, WATCHED_FRAMES) if name in watched_names else 1
-        item, scale = _reduced(record, frames), _factor(record.cameras)
+        scale = min(1.0, LONGEST / max(record.cameras.width, record.cameras.height))
+        item = _reduced(record, frames, scale)
         watched += [item] if name in watched_names else []
         first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))
     return Evidence(data, len(names), scene, scale, tuple(watched), tuple(first))
@@ -136,13 +136,8 @@ def _spread(names: list[str], count: int) -> list[str]:
     return [names[i] for i in chosen]
 
 
-def _factor(cameras: Cameras) -> float:
-    return min(1.0, LONGEST / max(cameras.width, cameras.height))
-
-
-def _reduced(record: SequenceRecord, frames: int) -> Watched:
+def _reduced(record: SequenceRecord, frames: int, factor: float) -> Watched:
     cameras = record.cameras
-    factor = _factor(cameras)
     width, height = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
     shape = (frames, len(record.views), height, width)
     rgb, alpha = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)

@@ -13,7 +13,7 @@ from gausim.runs.bar import with_bar
 # Each check with the others whose faults invalidate it, and its finders, one per kind of fault.
 CHECKS = (
     ("pins", (), (coverage.find_pins,)),
-    ("extent", (), (coverage.find_few_frames, coverage.find_few_sequences)),
+    ("extent", (), (coverage.find_few_frames,)),
     ("masks", (), (masks.find_mask_faults,)),
     ("calibration", ("masks",), (calibration.find_calibration_faults,)),
     ("views", ("masks", "calibration"), (coverage.find_like_directions, coverage.find_cut_off, coverage.find_tiny)),
@@ -58,7 +58,7 @@ def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
         else:
             findings += [replace(finding, check=name) for find in finders for finding in find(evidence)]
     # A camera whose clock is early disagrees with the rest scene, too; that is no finding of its own.
-    early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
-    kept = [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]
+    early = {view for f in findings if f.check == "clock" and f.severity != "note" for view in f.views}
+    kept = [f for f in findings if f.check != "calibration" or not f.views or not {*f.views} <= early]
     ordered = sorted(kept, key=lambda finding: SEVERITIES.index(finding.severity))
     return Examination(tuple(ordered), left_out, evidence)

@@ -45,26 +45,17 @@ def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
     covered = float(np.mean([(item.alpha[0, index] > 127).mean() for item in evidence.first]))
     if covered > _EVERYWHERE:
         return _not_cut_out(evidence, views, index)
-    fits: dict[str, float] = {}
+    proof, sure = "", False
     if evidence.rest is not None:
-        pairs = [
-            (item.alpha[0, v] / np.float32(255), rest.alpha[v])
-            for item, rest in zip(evidence.first, evidence.rest, strict=True)
-            for v in index
-        ]
-        fits = {"overlap": float(np.mean([overlap(a, b) for a, b in pairs])),
-                "overlap_inverted": float(np.mean([overlap(1 - a, b) for a, b in pairs]))}  # fmt: skip
-    known = bool(fits) and fits["overlap_inverted"] > fits["overlap"] + 0.3
-    proof = (
-        f" Inverted, they would overlap the rest scene's silhouettes by {fits['overlap_inverted']:.2f} instead of "
-        f"{fits['overlap']:.2f}." if known else ""
-    )  # fmt: skip
+        pairs = [(item.alpha[0, v] / np.float32(255), rest.alpha[v])
+                 for item, rest in zip(evidence.first, evidence.rest, strict=True) for v in index]  # fmt: skip
+        fits, inverted = (float(np.mean([overlap(abs(sign - a), b) for a, b in pairs])) for sign in (0, 1))
+        sure = inverted > fits + 0.3
+        proof = f" Inverted, they would overlap the rest scene's silhouettes by {inverted:.2f} instead of {fits:.2f}."
     return Finding(
-        "fault", "certain" if known else "likely",
-        f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle, "
-        f"so the background would be trained on and not the object.{proof}",
-        "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
-        {"views": views, "border": _AROUND, **fits},
+        "fault", "certain" if sure else "likely",
+        f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle."
+        f"{proof if sure else ''}", "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
     )  # fmt: skip
 
 
@@ -72,14 +63,11 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
     rims = [_rim(p).astype(np.float32) for i in evidence.first for p in i.rgb[0, index]]
     spread = float(np.median([rim.std(0).max() for rim in rims]))
     hue = float(np.median([np.ptp(rim.mean(0)) for rim in rims]))
-    looks = "uniform" if spread < _UNIFORM else "not uniform"
     backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend masks"
     return Finding(
         "fault", "certain",
-        f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background, which is "
-        f"{looks}, would be taken for the object.",
-        f"Make masks: `gausim prepare segment PICTURES --out OUT --backend {backend}`.",
-        {"views": views, "border_deviation": spread},
+        f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background would be taken "
+        "for the object.", f"Make masks: `gausim prepare segment PICTURES --out OUT --backend {backend}`.",
     )  # fmt: skip
 
 
@@ -96,7 +84,6 @@ def _empty(evidence: Evidence) -> Iterator[Finding]:
             "fault" if empty > _MANY else "warning", "certain",
             f"{view} {told}: the mask is empty (first: {first}).",
             f"Segment {view} again; where it does not see the object, take it out of dataset.json (field 'views').",
-            {"view": view, "empty": empty},
         )  # fmt: skip
 
 
@@ -116,7 +103,6 @@ def _haze(evidence: Evidence) -> Iterator[Finding]:
             f"A haze of faint alpha (1 to {_FAINT} of 255) lies around the object in {listed(hazy)}, over up to "
             f"{max(fractions.values()):.0%} of the picture. All alpha above 0 counts as foreground.",
             "Set alpha below 0.1 to 0 in the images, or segment again with `--floor 0.1`.",
-            {"haze": fractions},
         )  # fmt: skip
 
 
@@ -136,5 +122,4 @@ def _blinking(evidence: Evidence) -> Iterator[Finding]:
                 "warning", "likely",
                 f"The mask of {view} jumps in size by more than {_JUMP:.0%} for a frame or two: {listed(jumps)}.",
                 "Look at these frames; segment them again (`--radius 3` mends what flashes up or drops out).",
-                {"view": view, "frames": len(jumps)},
             )  # fmt: skip

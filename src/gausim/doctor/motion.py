@@ -44,14 +44,13 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
             f"Nothing moves: no part of the object leaves its place by more than {max(largest.values()):.2f} pixels in "
             f"any of {len(moving)} sequences.",
             "Record sequences in which the object is set off, or check that the frames are not one picture repeated.",
-            {"pixels": max(largest.values())},
         )  # fmt: skip
         return
     still = [name for name, pixels in largest.items() if pixels < _STILL]
     if still:
         yield Finding(
             "warning", "certain", f"Nothing moves in {listed(still)}.",
-            "Leave these sequences out; they teach nothing.", {"pixels": largest},
+            "Leave these sequences out; they teach nothing.",
         )  # fmt: skip
     typical = float(np.median([p for p in largest.values() if p >= _STILL]))
     if typical < _SMALL:
@@ -59,7 +58,7 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
             "warning", "likely",
             f"The motion is smaller than a pixel (at most {typical:.2f} pixels): noise and the edges of the masks are "
             "as large.",
-            "Push harder, film from nearer, or at a higher resolution.", {"pixels": largest},
+            "Push harder, film from nearer, or at a higher resolution.",
         )  # fmt: skip
     for v, view in enumerate(evidence.views):
         here = max(float(d[:, v].max()) for d in moving.values())
@@ -68,7 +67,6 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
                 "fault", "likely",
                 f"{view} shows no motion (at most {here:.2f} pixels), while others show {typical:.1f}: it may be one "
                 "picture repeated.", f"Export the frames of {view} again, or take it out of dataset.json.",
-                {"view": view, "pixels": here},
             )  # fmt: skip
     yield from _rates(evidence)
 
@@ -103,7 +101,6 @@ def find_unrest(evidence: Evidence) -> Iterator[Finding]:
         f"Frame 0 is not at rest in {listed(list(off))}: its silhouettes overlap {against} by {worst:.2f} only. A "
         "prediction starts from the rest scene, so it would begin at the wrong place.",
         "Begin each sequence at the last frame before the object is set off, or leave the sequence out.",
-        {"overlap": overlaps},
     )  # fmt: skip
 
 
@@ -158,36 +155,27 @@ def _pattern(item: Watched) -> np.ndarray:
 
 def _rates(evidence: Evidence) -> Iterator[Finding]:
     fps, (dominant, cycles) = evidence.data.fps, swing(evidence)
-    measured = {"frequency": dominant, "cycles": cycles, "fps": fps}
-    swings = cycles >= _CYCLES
-    pace = dominant / fps  # cycles per frame
+    swings, pace = cycles >= _CYCLES, dominant / fps  # cycles per frame
+    rate = f"The object swings at about {dominant:.2g} Hz at {fps:g} frames per second"
     if swings and pace > _FAST:
         yield Finding(
             "fault" if pace > _TOO_FAST else "warning", "likely",
-            f"The object swings at about {dominant:.2g} Hz, once in {1 / pace:.1f} frames at {fps:g} frames per "
-            "second: that is too fast for steps of a frame.",
-            "Film at a higher rate (five frames per swing or more), or keep every frame of the film.", measured,
+            f"{rate}, once in {1 / pace:.1f} frames: that is too fast for steps of a frame.",
+            "Film at a higher rate (five frames per swing or more), or keep every frame of the film.",
         )  # fmt: skip
-    usual = any(abs(fps / rate - 1) < _RATE_TOLERANCE for rate in _USUAL_RATES)
+    usual = any(abs(fps / known - 1) < _RATE_TOLERANCE for known in _USUAL_RATES)
     plausible = not swings or _SLOWEST <= dominant <= _FASTEST
-    if usual and plausible:
-        if swings:
-            yield Finding(
-                "note", "likely",
-                f"The object swings at about {dominant:.2g} Hz, once in {fps / dominant:.0f} frames at "
-                f"{fps:g} frames per second.",
-                "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.", measured,
-            )  # fmt: skip
-        return
-    reason = f"{fps:g} frames per second is no usual rate of a camera" if not usual else ""
-    if swings:
-        reason += f"{' and' if reason else 'At ' + format(fps, 'g') + ' frames per second'} the object would swing at "
-        reason += f"{dominant:.2g} Hz"
-    others = ", ".join(f"{dominant * rate / fps:.2g} Hz at {rate}" for rate in (24, 30, 60, 120, 240))
-    check = f" By a stopwatch: it would be {others}." if swings else ""
-    yield Finding(
-        "warning", "possible" if plausible else "likely",
-        f"{reason}: field 'fps' of dataset.json may be wrong. Velocities, stiffness and damping scale with it.",
-        "Set 'fps' in dataset.json and every sequences/*/transforms.json to the rate of the frames that are there (a "
-        f"film of 120 of which every fifth frame was kept has 24).{check}", measured,
-    )  # fmt: skip
+    if not (usual and plausible):
+        reason = f"{fps:g} frames per second is no usual rate of a camera. " if not usual else ""
+        yield Finding(
+            "warning", "possible" if plausible else "likely",
+            f"{reason}{f'{rate}. ' if swings else ''}Field 'fps' of dataset.json may be wrong. Velocities, stiffness "
+            "and damping scale with it.",
+            "Set 'fps' in dataset.json and every sequences/*/transforms.json to the rate of the frames that are there "
+            "(a film of 120 of which every fifth frame was kept has 24).",
+        )  # fmt: skip
+    elif swings:
+        yield Finding(
+            "note", "likely", f"{rate}.",
+            "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.",
+        )  # fmt: skip

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from jinja2 import Environment, StrictUndefined
 
 from gausim.doctor.evidence import SEVERITIES, listed
@@ -48,9 +48,8 @@ def summary_line(found: Examination) -> str:
 
 
 def plain_findings(found: Examination) -> dict[str, Any]:
-    """Findings and omitted checks as plain data for JSON, with null for values that are not finite."""
-    findings = msgspec.json.encode([vars(finding) for finding in found.findings], enc_hook=float)
-    return {"findings": msgspec.json.decode(findings), "left_out": found.left_out}
+    """Findings and omitted checks as plain data for JSON."""
+    return {"findings": [asdict(finding) for finding in found.findings], "left_out": found.left_out}
 
 
 def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str]]) -> None:
