@@ -24,7 +24,6 @@ from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.reconstruction.reconstruction import ROUNDS, Reconstruction, ReconstructionOptions, reconstruct
 from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.splats import LearningRates, Splats
-from gausim.reconstruction.state import Partial, identity
 from gausim.reconstruction.stills import ImageSet, measure, reduced
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw_still
@@ -157,33 +156,6 @@ def test_error_is_attributed_to_the_kernels_under_it(stills: ImageSet) -> None:
         rgb, _ = run._render(stills, 0, black, (means, covars, lit, opacities))
         assert float(run.splats.error[k]) == pytest.approx(float((rgb.mean(-1) * error).sum()), rel=1e-3)
     assert (run.splats.error == 0).any()
-
-
-def test_an_interrupted_reconstruction_goes_on_bit_by_bit(stills: ImageSet, tmp_path: Path) -> None:
-    options = ReconstructionOptions(kernels=60, iterations=30, hull_resolution=16)
-    whole = reconstruct([stills], RENDERER, options)
-    partial = Partial(tmp_path / "scene.ply", identity([stills], options, None))
-    assert partial.read() is None
-
-    def stop_at_half(run: Reconstruction) -> None:
-        if run.done == 17:
-            partial.write(run.state())
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        reconstruct([stills], RENDERER, options, progress=stop_at_half)
-    begun = partial.read()
-    assert begun is not None and int(begun["done"]) == 17
-    scene = reconstruct([stills], RENDERER, options, begun=begun)
-    for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
-        assert torch.equal(getattr(scene, name), getattr(whole, name)), name
-    for other in (replace(options, seed=1), replace(options, kernels=61)):
-        assert Partial(tmp_path / "scene.ply", identity([stills], other, None)).read() is None
-    assert Partial(tmp_path / "scene.ply", identity([stills.select(range(23))], options, None)).read() is None
-    partial.path.write_bytes(b"torn")
-    assert partial.read() is None
-    partial.remove()
-    assert not list(tmp_path.iterdir())
 
 
 def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:

@@ -16,15 +16,12 @@ if TYPE_CHECKING:
     from gausim.core import GaussianScene, Renderer
     from gausim.reconstruction.reconstruction import ReconstructionOptions
     from gausim.reconstruction.splat_start import PointCloud
-    from gausim.reconstruction.state import Partial
     from gausim.reconstruction.stills import ImageSet, Material
 
 
 # Images side by side in the comparison picture.
 COMPARED = 5
 LEFT_OUT_COMPARED = 2
-# Number of intermediate saves during the reconstruction of a scene.
-SAVES = 20
 # An open scene has parts of all sizes that occlude each other, and grows from few points.
 SCENE_OPTIONS: dict[str, Any] = {"kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0}
 
@@ -68,7 +65,6 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 
     from gausim.io.files import write_json
     from gausim.io.ply import save_scene
-    from gausim.reconstruction.state import Partial, identity
     from gausim.reconstruction.stills import measure
     from gausim.render.cpu import CpuRenderer
     from gausim.render.reference import ReferenceRenderer
@@ -78,8 +74,7 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     name, material, cloud, below_z = _inputs(source, arguments, options)
     renderer = CpuRenderer() if arguments.renderer == "cpu" else ReferenceRenderer()
     start = time.process_time()
-    partial = Partial(out, identity(material.train, options, cloud))
-    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments.pin, below_z=below_z)
+    scene = pinned_by(_fit(material, renderer, options, cloud, name), arguments.pin, below_z=below_z)
     seconds = time.process_time() - start
     save_scene(scene, out)
     record = {
@@ -91,7 +86,6 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     }
     write_json(out.with_suffix(".json"), record)
     _compare(scene, renderer, material.measure, out.with_suffix(".png"))
-    partial.remove()
     return record, _told(record, out, seconds)
 
 
@@ -196,31 +190,20 @@ def _cloud(path: str | None) -> PointCloud | None:
 
 
 def _fit(
-    material: Material,
-    renderer: Renderer,
-    options: ReconstructionOptions,
-    cloud: PointCloud | None,
-    name: str,
-    partial: Partial,
+    material: Material, renderer: Renderer, options: ReconstructionOptions, cloud: PointCloud | None, name: str
 ) -> GaussianScene:
     from rich.progress import TextColumn, TimeRemainingColumn
 
     from gausim.reconstruction.reconstruction import Reconstruction, reconstruct
 
-    begun = partial.read()
-    if begun is not None:
-        print(f"goes on from step {int(begun['done'])} of an interrupted reconstruction")
     state = TextColumn("{task.completed}/{task.total}  {task.fields[state]}")
-    every = max(1, options.iterations // SAVES)
     with bars(state, TimeRemainingColumn()) as bar:
         task = bar.add_task("reconstruct", total=options.iterations, state="placing the first kernels")
 
         def show(run: Reconstruction) -> None:
             bar.update(task, completed=run.done, state=f"loss {run.loss:.5f}  kernels {run.splats.count}")
-            if run.done % every == 0:
-                partial.write(run.state())
 
-        return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show, begun=begun)
+        return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show)
 
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:

@@ -64,7 +64,8 @@ def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "fault" if angle < _SAME else "warning", "certain",
             f"The training views {listed(names)} look along nearly the same line ({angle:.0f} degrees): depth is "
-            "hardly seen.", "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
+            "hardly seen.",
+            "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
         )  # fmt: skip
 
 

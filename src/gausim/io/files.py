@@ -32,7 +32,7 @@ def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) 
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         if previous is not None and path.is_file():
-            _keep(path, previous)
+            os.replace(path, previous)  # for a moment only ``previous`` exists
         os.replace(temporary, path)
         _sync_directory(path.parent)
     finally:
@@ -90,21 +90,6 @@ def remove_leftovers(folder: Path, *, deep: bool = False) -> None:
     for path in folder.rglob(".*.tmp*") if deep else folder.glob(".*.tmp*"):
         if _LEFTOVER.fullmatch(path.name):
             path.unlink(missing_ok=True)
-
-
-def _keep(path: Path, previous: Path) -> None:
-    """Gives a file the second name ``previous``, so that ``path`` exists at every moment."""
-    link = previous.with_name(f".{previous.name}.{os.getpid()}.tmp")
-    link.unlink(missing_ok=True)
-    try:
-        os.link(path, link)
-    except OSError:
-        os.replace(path, previous)  # a file system without hard links: for a moment only `previous` exists
-        return
-    try:
-        os.replace(link, previous)
-    finally:
-        link.unlink(missing_ok=True)  # still exists if both names were already the same file
 
 
 def _sync_directory(folder: Path) -> None:

@@ -172,21 +172,18 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     """The f_rest properties in order, after checking that all properties of 3DGS exist."""
-    missing = [n for n in (*_POSITION, *_COLOR, *_SHAPE) if n not in names]
-    if missing:
-        raise SceneError(
-            f"{path}: property '{missing[0]}' is missing (missing in all: {', '.join(missing)}). Expected a 3DGS PLY; "
-            "a plain point cloud or mesh must be reconstructed first (`gausim reconstruct`)."
-        )
     count = sum(n.startswith("f_rest_") for n in names)
     if count not in _REST_COUNTS:
         raise SceneError(
             f"{path}: {count} properties 'f_rest_*'; expected 0, 9, 24 or 45 (SH degree 0, 1, 2 or 3). Export again."
         )
     rest = [f"f_rest_{i}" for i in range(count)]
-    absent = [n for n in rest if n not in names]
-    if absent:
-        raise SceneError(f"{path}: property '{absent[0]}' is missing among {count} 'f_rest_*'. Export again.")
+    missing = [n for n in (*_POSITION, *_COLOR, *_SHAPE, *rest) if n not in names]
+    if missing:
+        raise SceneError(
+            f"{path}: property '{missing[0]}' is missing (missing in all: {', '.join(missing)}). Expected a 3DGS PLY; "
+            "a plain point cloud or mesh must be reconstructed first (`gausim reconstruct`)."
+        )
     return rest
 
 

@@ -51,13 +51,13 @@ def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[
     found = _numbered(folder)
     stems = sorted({stem for _, stem, _ in found})
     if len(stems) != 1:
-        what = f"frames of several sequences: {stems[:5]}" if stems else "no files NAME_0001.ply, NAME_0002.ply, ..."
-        raise DataError(f"{folder}: has {what}; expected those of one sequence.")
+        raise DataError(f"{folder}: expected files NAME_0001.ply, NAME_0002.ply, ... of one sequence, got {stems[:5]}.")
     numbers = [number for number, _, _ in found]
-    if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
-        missing = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
-        what = f"number {missing[0]} is missing" if missing else "a number stands there twice"
-        raise DataError(f"{folder}: {what}. Complete the sequence.")
+    wrong = next(
+        (n for n, expected in zip(numbers, range(numbers[0], numbers[-1] + 1), strict=False) if n != expected), None
+    )
+    if wrong is not None:
+        raise DataError(f"{folder}: a number before {wrong} is missing, or stands there twice. Complete the sequence.")
     path = folder / f"{stems[0]}.json"
     if fps is None and not path.is_file():
         raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")

