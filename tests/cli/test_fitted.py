@@ -15,6 +15,7 @@ from helpers.toy_runs import rows
 from gausim.cli import evaluate, report, simulate, train
 from gausim.compose.build import load_run
 from gausim.core import ConfigError
+from gausim.results.table import load_results
 from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
@@ -66,11 +67,11 @@ def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) 
     assert train.main([f"model={model}", *SMALL[model], *arguments]) == 0
     run = Path("outputs/toy/seed_0")
     assert evaluate.main([str(run)]) == 0
-    entry = json.loads((run / "evaluation" / "metrics.json").read_text())["objects"]["toy"]
-    (row,) = entry["methods"]
-    notes = entry["footnotes"][row]["notes"]
+    results = load_results(run / "evaluation" / "metrics.json")
+    (row,) = results.objects["toy"].methods
+    notes = results.objects["toy"].notes[row]
     name = {"linear_tracks": "linear AR(2) on tracked motion"}.get(model, model)
-    assert row.startswith(name) and row in entry["rows"] and notes
+    assert row.startswith(name) and row in {e.row for e in results.table} and notes
     assert all(note in (run / "evaluation" / "table.md").read_text() for note in notes)
     assert simulate.main([str(run), "--frames", "12", "--cameras", "cam_0"]) == 0
     assert report.main([str(run), "--out", "page", "--no-pictures"]) == 0

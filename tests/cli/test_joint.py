@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from gausim.cli import evaluate
 from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
+from gausim.results.table import load_results
 from gausim.training.callbacks.resume import RunCheckpoint
 
 NETWORK = "model.predictor.network."
@@ -39,9 +39,9 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
     assert [o.sequences[0].cameras.width for o in run.objects] == [32, 24]
     assert [int(s.pinned.sum()) for s in simulator.scenes] == [9, 9]  # the second store's own selection, 15 without
     assert evaluate.main([str(joint), "--cameras", "train", "--out", str(tmp_path)]) == 0
-    objects = json.loads((tmp_path / "metrics.json").read_text())["objects"]
-    assert {name: o["splits"]["seen"] for name, o in objects.items()} == {"toy": [0, 8], "other": [0, 6]}
-    errors = [o["rows"]["gausim"]["seen"]["train"]["l2"]["mean"] for o in objects.values()]
+    results = load_results(tmp_path / "metrics.json")
+    assert {name: o.splits["seen"] for name, o in results.objects.items()} == {"toy": (0, 8), "other": (0, 6)}
+    errors = [e.value for e in results.table if (e.row, e.split, e.metric) == ("gausim", "seen", "l2")]
     assert errors[0] != errors[1] and min(errors) > 0
 
 

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ import torch
 from gausim.pictures.figures import diagnosis_figure, diagnosis_plot
 from gausim.results.curves import TRUTH
 from gausim.results.diagnosis import Diagnosis, read_diagnosis
+from gausim.results.table import ObjectInfo
 
 FPS, FRAMES = 24.0, 61
 REST = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
@@ -30,18 +32,20 @@ def motion(frequency: float, damping: float, lag: float = 0.0, size: float = 0.1
     return REST + size * (wave[:, None, None] * BEND + other[:, None, None] * TWIST)
 
 
-def entry(**rows: torch.Tensor) -> dict[str, Any]:
+def made_of(**rows: torch.Tensor) -> dict[str, Any]:
     diagnosis = Diagnosis(FPS)
     for scale in (1.0, -0.6):
         scaled = {name: REST + scale * (points - REST) for name, points in rows.items()}
         diagnosis.add(REST + scale * (motion(2.0, 0.05) - REST), REST, scaled)
-    return {"diagnosis": diagnosis.summary(), "splits": {"seen": [0, 16]}, "methods": list(rows)}
+    found = diagnosis.summary()
+    assert found is not None
+    return found
 
 
 def test_what_differs_is_told_and_nothing_else() -> None:
-    made = entry(same=motion(2.0, 0.05), slow=motion(1.8, 0.05), damped=motion(2.0, 0.1), late=motion(2.0, 0.05, 0.4),
+    made = made_of(same=motion(2.0, 0.05), slow=motion(1.8, 0.05), damped=motion(2.0, 0.1), late=motion(2.0, 0.05, 0.4),
                  still=REST.expand(FRAMES, -1, -1))  # fmt: skip
-    found = read_diagnosis(json.loads(json.dumps(made)))  # it is written to a file
+    found = read_diagnosis(json.loads(json.dumps(made)), 16)  # it is written to a file
     assert found is not None
     assert len(found.fraction) == 2 and sum(found.fraction) == pytest.approx(1, abs=1e-5)
     assert found.frequency_error("same") < 1e-4 and found.damping_ratio("same") == pytest.approx(1, abs=1e-3)
@@ -69,29 +73,28 @@ def test_errors_are_told_by_level() -> None:
     assert row["level_errors"][0] == pytest.approx(0.05 * math.sqrt(3) / float(still), rel=1e-4)
     assert row["level_errors"][1] < 1e-5 and row["level_errors"][2] < 1e-5
     assert "level_errors" not in diagnosis.summary()["rows"]["flat"]
-    found = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, 16]}})
+    found = read_diagnosis(diagnosis.summary(), 16)
     assert found is not None and found.rows["a"].level_errors[0] > 1e3 * found.rows["a"].level_errors[-1]
     assert found.rows["flat"].level_errors == []
 
 
 def test_pictures_are_drawn_and_damaged_entries_are_not(tmp_path: Path) -> None:
-    made = entry(gausim=motion(1.9, 0.1), reference=motion(2.0, 0.2))
-    made["methods"] = ["gausim"]
-    assert diagnosis_figure("toy", made, tmp_path / "motion.png")
+    made = made_of(gausim=motion(1.9, 0.1), reference=motion(2.0, 0.2))
+    info = ObjectInfo(splits={"seen": (0, 16)}, methods=["gausim"], diagnosis=made)
+    assert diagnosis_figure("toy", info, tmp_path / "motion.png")
     assert (tmp_path / "motion.png").stat().st_size > 10_000
-    found = read_diagnosis(made)
+    found = read_diagnosis(made, 16)
     assert found is not None
     left, right = diagnosis_plot([("ours", found, "gausim")], title="t").axes
     assert [line.get_label() for line in left.lines] == [TRUTH, "ours", "reference"]
     np.testing.assert_allclose(right.lines[0].get_ydata(), found.rows["gausim"].phase_error)
     for damage in (
-        {"diagnosis": None},
-        {"diagnosis": {"rows": []}},
-        {"splits": {"seen": ["a", "b"]}},
-        {"diagnosis": {**made["diagnosis"], "share": "long"}},
-        {"diagnosis": {**made["diagnosis"], "rows": {"gausim": made["diagnosis"]["rows"]["gausim"]}}},
-        {"diagnosis": {**made["diagnosis"], "rows": {TRUTH: {"spectrum": [1.0], "frequencies": [{}]}}}},
+        None,
+        {"rows": []},
+        {**made, "share": "long"},
+        {**made, "rows": {"gausim": made["rows"]["gausim"]}},
+        {**made, "rows": {TRUTH: {"spectrum": [1.0], "frequencies": [{}]}}},
     ):
-        assert read_diagnosis({**made, **damage}) is None
-        assert not diagnosis_figure("toy", {**made, **damage}, tmp_path / "no.png")
+        assert read_diagnosis(damage, 16) is None
+        assert not diagnosis_figure("toy", msgspec.structs.replace(info, diagnosis=damage), tmp_path / "no.png")
     assert not (tmp_path / "no.png").exists()

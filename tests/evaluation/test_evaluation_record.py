@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import subprocess
 import time
 from pathlib import Path
@@ -44,21 +43,20 @@ class Oracle:
 def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     methods = {"oracle": Oracle(toy), "bare": lambda record: toy.truth(record.name)}
     curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer())
-    summary = write_evaluation(tmp_path, [curves], {"name": "toy"})
-    assert summary["provenance"]["gausim"] == gausim.__version__
-    entry = json.loads((tmp_path / "metrics.json").read_text())["objects"]["toy"]
-    efficiency = entry["efficiency"]
-    assert efficiency["oracle"]["levels"] == Oracle.levels and efficiency["bare"]["levels"] is None
-    assert efficiency["oracle"]["frames"] == 18 and efficiency["oracle"]["seconds_per_frame"]["mean"] > 0
-    assert efficiency["oracle"]["seconds_per_image"] > 0 and entry["absent"]["lpips"] == "no weights"
+    results = write_evaluation(tmp_path, [curves], {"name": "toy"})
+    assert results.provenance["gausim"] == gausim.__version__
+    found = {(e.row, e.metric): e.value for e in results.table if e.split == ""}
+    assert found["oracle", "units"] == "36 → 4" and ("bare", "units") not in found
+    assert found["oracle", "per_frame"] > 0 and found["oracle", "per_image"] > 0
+    info = results.objects["toy"]
     for key, name in (("scene", "scene.ply"), ("manifest", "dataset.json")):
         expected = hashlib.sha256((toy.root / name).read_bytes()).hexdigest()
-        assert entry["sources"][key] == {"file": name, "sha256": expected}
+        assert info.sources[key] == {"file": name, "sha256": expected}
     (pictures,) = load_pictures(tmp_path / "pictures.npz")
     assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
     difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
     assert pictures.truth.shape == (10, 3, 32, 32, 4) and np.abs(difference).max() <= 2
-    assert pictures.background is None and entry["absent"] == {"lpips": "no weights"}
+    assert pictures.background is None and info.absent == {"lpips": "no weights"}
 
 
 def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):

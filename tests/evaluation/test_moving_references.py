@@ -54,36 +54,36 @@ def falling(tmp_path_factory):
     methods = {"oracle": lambda record: oracle}
     curves = evaluate_object(data, data.scene(), methods, ReferenceRenderer(), sequences=["seq_000"])
     folder = tmp_path_factory.mktemp("evaluation")
-    return shift, write_evaluation(folder, [curves], {})["objects"]["toy"], (folder / "table.md").read_text()
+    results = write_evaluation(folder, [curves], {})
+    found = {(e.row, e.split, e.metric): e.value for e in results.table if e.views == "points"}
+    return shift, results, found, (folder / "table.md").read_text()
 
 
 def test_a_falling_body_is_compared_with_rigid_flight(falling):
-    _, entry, _ = falling
-    assert entry["reference"] == "ballistic"
-    assert list(entry["rows"]) == ["oracle", "ballistic"], "linear references need a rest state"
-    cells = entry["rows"]["ballistic"]
+    _, results, found, _ = falling
+    assert results.objects["toy"].reference == "ballistic"
+    kinds = {entry.row: entry.kind for entry in results.table if entry.metric == "error_3d"}
+    assert kinds == {"oracle": "method", "ballistic": "informed"}, "linear references need a rest state"
     # Before the contact and after the last seen frame it is right, for the truth is rigid.
-    assert cells["unseen_near"]["points"]["error_3d"]["mean"] < 0.02
-    assert cells["seen"]["points"]["error_3d"]["mean"] > 0.3, "it stays on the floor, the truth leaves it"
-    oracle = entry["rows"]["oracle"]["seen"]["points"]
-    assert oracle["error_3d"]["ratio"] < 1e-3 and oracle["track_error"]["mean"] < 1e-5
-    assert oracle["chamfer"]["mean"] < 1e-5
+    assert found["ballistic", "unseen_near", "error_3d"] < 0.02
+    assert found["ballistic", "seen", "error_3d"] > 0.3, "it stays on the floor, the truth leaves it"
+    assert found["oracle", "seen", "error_3d_ratio"] < 1e-3 and found["oracle", "seen", "track_error"] < 1e-2
+    assert found["oracle", "seen", "chamfer"] < 1e-2  # [1e-3 scene units]
 
 
 def test_bounce_is_that_of_the_formula(falling):
-    shift, entry, table = falling
-    truth = entry["bounce"]["truth"]
-    assert truth["rise"] == pytest.approx(float(shift[LANDED:, 2].max()), abs=1e-4)
-    assert truth["height_error"] == 0 and truth["depth"] == pytest.approx(0, abs=1e-4)
-    assert entry["bounce"]["oracle"]["rise_error"] < 1e-3
-    assert "centre after the first contact" in table and "/ ballistic" in table
+    shift, _, found, table = falling
+    assert found["truth", "bounce", "rise"] == pytest.approx(float(shift[LANDED:, 2].max()), abs=1e-4)
+    assert found["truth", "bounce", "height_error"] == 0
+    assert found["truth", "bounce", "depth"] == pytest.approx(0, abs=1e-4)
+    assert found["oracle", "bounce", "rise_error"] < 0.1  # [%]
+    assert "centre after the first contact" in table and "÷ ballistic" in table
 
 
 def test_errors_by_frames_ahead_begin_after_the_last_seen_frame(falling):
-    _, entry, table = falling
-    assert entry["horizon"]["frames"] == [1, 2, 5]
-    means = entry["horizon"]["rows"]["ballistic"]["points"]["error_3d"]
-    assert len(means) == 3 and means[0] < 1e-3
+    _, _, found, table = falling
+    ahead = {split: value for (row, split, _), value in found.items() if row == "ballistic" and split[0] == "+"}
+    assert list(ahead) == ["+1", "+2", "+5"] and ahead["+1"] < 1e-3
     assert "| +1 | +2 | +5 |" in table
 
 

@@ -6,17 +6,19 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import yaml
 
-from gausim.report.gather.runs import find_runs
-from gausim.report.gather.study import Study, make_study
-from gausim.report.tables.overview import make_sheets
-from gausim.report.tables.sheets import Sheet
+from gausim.evaluation.evaluation import results_of
+from gausim.report.layouts import grids
+from gausim.report.runs import find_runs
+from gausim.report.study import Study, make_study
 from gausim.report.write import write_report
 from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, save_curves
 from gausim.results.pictures import Pictures, save_pictures
-from gausim.results.summary import write_summary
+from gausim.results.pivot import Grid, cell_texts
+from gausim.results.table import save_results
 
 NO_HIERARCHY = {"hierarchy": {"levels": [{"diameter": 0.0, "edge_length": 0.1}]}}
 FRAMES, FIRST_UNSEEN = 60, 16
@@ -110,7 +112,8 @@ def evaluate(run: Path, *curves: ObjectCurves, finished: bool = True, commit: st
     folder.mkdir()
     state = {"name": "toy", "finished": finished, "epoch": 2, "updates": 12}
     provenance = {"gausim": "0.1.0", "torch": "2", "python": "3", "commit": commit, "modified": False}
-    write_summary(folder / "metrics.json", list(curves), state, provenance=provenance)
+    results = msgspec.structs.replace(results_of(list(curves), state), provenance=provenance)
+    save_results(folder / "metrics.json", results)
     save_curves(folder / "metrics.npz", list(curves))
     save_pictures(folder / "pictures.npz", [c.pictures for c in curves if c.pictures is not None])
     return run
@@ -131,8 +134,18 @@ def study_of(root: Path) -> Study:
     return make_study(find_runs([root]))
 
 
-def sheets_of(root: Path) -> dict[str, Sheet]:
-    return {sheet.key: sheet for sheet in make_sheets(study_of(root))}
+def grids_of(root: Path) -> dict[str, Grid]:
+    """The tables of a report by the beginning of their titles."""
+    return {grid.title: grid for grid in grids(study_of(root))}
+
+
+def shown(grid: Grid) -> dict[str, list[str]]:
+    """The texts of a grid by row, the best with a star."""
+    return {
+        line.label: [" ".join(filter(None, cell_texts(cell, column.digits))) + "*" * best
+                     for cell, column, best in zip(line.cells, grid.columns, line.best, strict=True)]
+        for line in grid.lines
+    }  # fmt: skip
 
 
 def page_of(root: Path, **options: Any) -> str:

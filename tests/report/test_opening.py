@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,41 +18,37 @@ from helpers.report_runs import config, evaluate, make_curves, page_of, study_of
 from gausim.io.video import read_video
 from gausim.pictures.frames import SEEN
 from gausim.report.opening import MOST_OPENINGS, MOST_ROWS, make_openings
-from gausim.report.tables.verdict import outcome, sentences
+from gausim.report.verdict import outcome, sentences
 from gausim.results.curves import ImageMetricInfo
+from gausim.results.pivot import Pivot
+from gausim.results.table import NO_FORESIGHT, SCHEMA, Entry, Metric, ObjectInfo, Results
 
 EVIL = "<script>alert(1)</script>&\"'|`"
 
 
-def entry(
+def said(
     error: float | None = 0.3, seen: float | None = 0.2, energy: float | None = 0.9, *, views: str = "points",
-    new: float | None = 27.0, **more: Any,
-) -> dict[str, Any]:  # fmt: skip
-    """An object in metrics.json; PSNR 27.4 dB in the training views, 21.5 dB without motion."""
-    metric = "error_3d" if views == "points" else "l2"
-
-    def row(unseen: float | None, known: float | None, trained: float, heldout: float | None) -> dict[str, Any]:
-        def cells(ratio: float | None) -> dict[str, Any]:
-            found: dict[str, Any] = {"train": {"psnr": {"mean": trained}}, "heldout": {"psnr": {"mean": heldout}}}
-            figures = {metric: {"mean": 1.0, "ratio": ratio}, "motion_energy": {"pooled": energy}}
-            found[views] = found.get(views, {}) | figures
-            return found
-
-        return {"seen": cells(known), "unseen": cells(unseen)}
-
-    return {
-        "splits": {"seen": [0, 16], "unseen": [16, 50]}, "heldout_views": ["cam_4"] if new is not None else [],
-        "rows": {"m": row(error, seen, 27.4, new), "static": row(1.0, 1.0, 21.5, None if new is None else 21.0)},
-        **more,
-    }  # fmt: skip
-
-
-def said(*entries: dict[str, Any]) -> tuple[str, str, str]:
-    return sentences(outcome(entries, "m"))
+    new: float | None = 27.0, seeds: Sequence[float | None] = (), unseen: bool = True, repeats: bool = False,
+) -> tuple[str, str, str]:  # fmt: skip
+    """Sentences on an evaluation; PSNR 27.4 dB in the training views, 21.5 dB without motion."""
+    metric = "error_3d_ratio" if views == "points" else "l2_ratio"
+    splits = {"seen": (0, 16)} | ({"unseen": (16, 50)} if unseen else {})
+    table = []
+    for split in splits:
+        errors = (list(seeds) or [error]) if split == "unseen" else [seen]
+        table += [Entry("m", "method", "o", split, views, metric, i, e) for i, e in enumerate(errors) if e is not None]
+        figures = [("m", views, "motion_energy", energy), ("m", "train", "psnr", 27.4), ("m", "heldout", "psnr", new),
+                   ("static", "train", "psnr", 21.5), ("static", "heldout", "psnr", new and 21.0)]  # fmt: skip
+        table += [Entry(row, "method", "o", split, v, m, None, x) for row, v, m, x in figures if x is not None]
+    info = ObjectInfo(splits, methods=["m"], heldout_views=["cam_4"] if new is not None else [],
+                      notes={"m": [NO_FORESIGHT] * repeats})  # fmt: skip
+    metrics = {m: Metric(m) for m in (metric, "motion_energy", "psnr")}
+    pivot = Pivot(Results(SCHEMA, objects={"o": info}, metrics=metrics, table=table))
+    return sentences(outcome(pivot, "o", "m", info))
 
 
 def test_a_good_run_is_called_good():
-    assert said(entry()) == (
+    assert said() == (
         "On frames never seen (16–49), its points are 0.30 times as far off as those of a model that predicts no "
         "motion (0.20 on the frames it was trained on): it foresees most of the motion.",
         "Its motion there has 0.90 times the energy of the true motion: it is about as lively as the object.",
@@ -77,30 +74,28 @@ def test_a_good_run_is_called_good():
     ],
 )
 def test_mediocre_failed_and_too_lively_runs_are_called_so(sentence, error, seen, energy, words):
-    assert said(entry(error, seen, energy))[sentence].endswith(f"{words}.")
+    assert said(error, seen, energy)[sentence].endswith(f"{words}.")
 
 
 def test_views_that_are_worse_or_missing():
-    assert "(cam_4), its images have a PSNR of 20.0 dB, worse than in" in said(entry(new=20.0))[2]
-    assert "1.0 dB below those of a model" in said(entry(new=20.0))[2]
-    alone = said(entry(new=None))[2]
+    assert "(cam_4), its images have a PSNR of 20.0 dB, worse than in" in said(new=20.0)[2]
+    assert "1.0 dB below those of a model" in said(new=20.0)[2]
+    alone = said(new=None)[2]
     assert alone.startswith("No view was kept out of training") and "27.4 dB and 5.9 dB above" in alone
 
 
 def test_what_is_not_measured_is_not_made_up():
-    first, second, _ = said(entry(None, None, None))
+    first, second, _ = said(None, None, None)
     assert all("`gausim evaluate RUN`" in s for s in (first, second)) and not re.search(r"nan|None|inf", first + second)
-    images = said(entry(views="train"))[0]
+    images = said(views="train")[0]
     assert "its images in the training views are 0.30 times as far off (l2)" in images
-    short = entry()
-    del short["splits"]["unseen"], short["rows"]["m"]["unseen"]
-    assert said(short)[0].startswith("The recordings end with the frames trained on") and "0.20 times" in said(short)[0]
+    short = said(unseen=False)[0]
+    assert short.startswith("The recordings end with the frames trained on") and "0.20 times" in short
 
 
 def test_seeds_are_averaged_and_a_fit_that_repeats_is_no_foresight():
-    assert "(16–49; mean of 2 seeds), its points are 0.40 times" in said(entry(0.3), entry(0.5))[0]
-    repeats = {"m": {"extrapolates": False, "notes": []}}
-    assert said(entry(footnotes=repeats))[0].endswith(
+    assert "(16–49; mean of 2 seeds), its points are 0.40 times" in said(seeds=(0.3, 0.5))[0]
+    assert said(repeats=True)[0].endswith(
         "does not foresee, but repeats what was fitted to the frames it was trained on."
     )
 
@@ -131,13 +126,12 @@ def test_the_first_screen_is_a_video_three_sentences_and_a_small_table(page: str
     text = re.search(r'<div class="sentences">(.*?)</div>', first, re.S)[1]
     assert len(re.findall(r"<p>[^<]+\.</p>", text)) == 3 and "0.25 times as far off" in text
     assert first.count("<table") == 1
-    rows = re.findall(r"<tr class=.*?</tr>", first, re.S)
-    cells = [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in rows]
-    assert len(rows) == MOST_ROWS and [row[:2] for row in cells] == [
-        ["seen 0–15", "training"], ["", "new"], ["unseen 16–49", "training"], ["", "new"], ["no motion", "training"],
-        ["", "new"],
+    assert re.findall(r"<th>(.*?)</th>", first) == [
+        "frames", "PSNR [dB]", "PSNR [dB], new views", "SSIM [1e-1]", "3D ÷ static", "motion energy", "seen 0–15",
+        "unseen 16–49", "no motion",
     ]  # fmt: skip
-    assert cells[2][2:] == ["20.6", "0.990", "0.25", "0.50"]  # PSNR, SSIM, 3D over static, energy
+    row = re.search(r"<th>unseen 16–49</th>.*?</tr>", first, re.S)[0]
+    assert re.findall(r">([\d.]+)<", row) == ["20.62", "20.62", "9.90", "0.250", "0.50"]
     assert "LPIPS: its weights were not there" in first and page.count("<details") >= 5
 
 
@@ -163,9 +157,9 @@ def test_several_rows_are_compared_in_the_one_table_and_runs_can_be_chosen(tmp_p
     openings, left = make_openings(study, pictures=False)
     assert len(openings) == MOST_OPENINGS and left == 2
     assert openings[0].run.name == "r7" and openings[0].label == "gausim (run7)"
-    table = openings[0].table
-    assert [row[0] for row in table.rows] == [*(f"gausim (run{i})" for i in (7, 6, 5, 4, 3)), "no motion"]
-    assert "views never trained on" in table.title and "best 5 of 8" in table.title
+    grid = openings[0].grid
+    assert [line.label for line in grid.lines] == [*(f"gausim (run{i})" for i in (7, 6, 5, 4, 3)), "no motion"]
+    assert len(grid.lines) == MOST_ROWS and "best 5 of 8" in grid.caption
     page = page_of(tmp_path, pictures=False)
     assert page.count('type="radio"') == MOST_OPENINGS == page.count('<section class="opening"')
     assert page.count(" checked>") == 1 and "and 2 more:" in page and "<script" not in page

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.markdown import Markdown
 
-from gausim.cli.output import end, error_sentences, named_bar
+from gausim.cli.output import end, named_bar
 from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
 from gausim.compose.data_paths import data_option
 from gausim.compose.predict import TrainedPrediction, endurance, run_objects, scene_of, sequence_of, state_of
@@ -21,6 +21,7 @@ from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figure
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.metrics import FLIP
 from gausim.pictures.figures import diagnosis_figure, endurance_figure, error_figure
+from gausim.report.verdict import first_sentences
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
 from gausim.runs.directory import RunDirectory
@@ -55,12 +56,12 @@ def evaluate(arguments: argparse.Namespace) -> int:
     whole = _home(run.run_dir, part)
     partial = arguments.objects or arguments.sequences or arguments.cameras != "all"  # never overwrites the whole
     folder = arguments.out or (whole / "partial" if partial else whole)
-    summary = write_evaluation(folder, results, facts)
+    written = write_evaluation(folder, results, facts)
     drawn: list[str] = []
     for curves in results:
         name = curves.facts.name
         error_figure(curves, folder / f"errors_{name}.png")
-        shown = diagnosis_figure(name, summary["objects"][name], folder / f"motion_{name}.png")
+        shown = diagnosis_figure(name, written.objects[name], folder / f"motion_{name}.png")
         drawn += [f"errors_{name}.png", *([f"motion_{name}.png"] if shown else [])]
     if arguments.endurance is not None:
         drawn += _endure(run, arguments, folder)
@@ -73,7 +74,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
     commands = ["report", "simulate"] if folder == run.run_dir / "evaluation" else ["evaluate"]
     following = [[command, arguments.run] for command in commands]
-    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *following)
+    end(first_sentences(written), "tables", folder / "table.md", *following)
     return 0
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
@@ -61,10 +61,3 @@ def program() -> str:
 def push(run: Path | str, name: str | None = None) -> list[object]:
     """The command that pushes an object of a run."""
     return ["simulate", run, *(["--objects", name] if name else []), *PUSH.split()]
-
-
-def error_sentences(entries: Mapping[str, dict[str, Any]]) -> list[str]:
-    """One sentence per object of ``metrics.json`` on the error of its first method in unseen frames."""
-    from gausim.report.tables.verdict import outcome, sentences
-
-    return [f"{name}: {sentences(outcome([entry], str(entry['methods'][0])))[0]}" for name, entry in entries.items()]

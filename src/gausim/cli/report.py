@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
 def _write_page(target: Path) -> int:
     """Writes a page from the template and the records in the folder of its name."""
     from gausim.io.files import write_durably
-    from gausim.report.records.print import page
+    from gausim.report.render import page
 
     write_durably(target, page(target.with_suffix("")).encode())
     print(f"page: {target.resolve().as_uri()}")
@@ -66,39 +66,40 @@ def _draw_bodies(dirs: list[Path], target: Path) -> int:
 
 
 def _write_results(arguments: argparse.Namespace) -> int:
-    """Writes the record of runs, and tables of it."""
-    from gausim.report.gather.runs import find_runs
-    from gausim.report.gather.study import make_study
-    from gausim.report.records.measure import measured_record
-    from gausim.report.records.record import save_record
+    """Writes the long table of runs as a record, and tables of it."""
+    from gausim.report.runs import find_runs
+    from gausim.report.study import make_study
     from gausim.report.write import write_tables
+    from gausim.results.table import save_results
 
-    study = make_study(find_runs(arguments.dirs, skip=arguments.results))
-    record = measured_record(study, arguments.title)
-    if not record.tables:
+    study = make_study(find_runs(arguments.dirs, skip=arguments.results), arguments.title)
+    if not study.results.table:
         raise RunError(
             f"{' '.join(map(str, arguments.dirs))}: no run here is evaluated, so there is no figure. "
             "Evaluate them with `gausim evaluate RUN`."
         )
     if arguments.results:
-        print(f"tables: {write_tables(arguments.results, record, study.notes)[0].resolve().as_uri()}")
+        print(f"tables: {write_tables(arguments.results, study, study.notes)[0].resolve().as_uri()}")
     if arguments.record:
         arguments.record.parent.mkdir(parents=True, exist_ok=True)
-        save_record(arguments.record, record)
+        save_results(arguments.record, study.results)
         print(f"record: {arguments.record.resolve().as_uri()}")
     return 0
 
 
 def _next(report: Report) -> list[list[object]]:
     """Next commands for the best run, or without evaluations the commands that evaluate runs."""
-    from gausim.report.gather.runs import NOT_EVALUATED
+    from gausim.report.runs import NOT_EVALUATED
 
     if not report.openings:
         trained = [run for run in report.study.runs if run.status == NOT_EVALUATED]
         return [["evaluate", run.path] for run in trained[:3]]
     best = report.openings[0]
-    objects = (best.run.summary or {}).get("objects", {})
-    return [["view", best.run.path], push(best.run.path, best.name if len(objects) > 1 else None), list(OWN_OBJECT)]
+    return [
+        ["view", best.run.path],
+        push(best.run.path, best.name if len(best.run.objects) > 1 else None),
+        list(OWN_OBJECT),
+    ]
 
 
 def _parser() -> argparse.ArgumentParser:

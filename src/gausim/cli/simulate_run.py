@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from gausim.cli.arguments import opened_scene, parse_background, pinned_by
-from gausim.cli.output import end, error_sentences, named_bar, push
+from gausim.cli.output import end, named_bar, push
 from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.config import compose, instantiate
 from gausim.compose.data_paths import data_option
@@ -22,7 +22,7 @@ from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.images import composite
 from gausim.data.records import SequenceRecord
-from gausim.evaluation.evaluation import evaluate_object
+from gausim.evaluation.evaluation import evaluate_object, results_of
 from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
 from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
 from gausim.interaction.replay import replay
@@ -35,7 +35,7 @@ from gausim.ops.orbit import orbit_cameras
 from gausim.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
 from gausim.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
 from gausim.render.draw import film, to_bytes
-from gausim.results.summary import summarise
+from gausim.report.verdict import first_sentences
 
 # Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].
 FRAMES, SWAY = 120, 0.02
@@ -81,7 +81,8 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
     for name in names:
         _list(folder / name, arguments)
     of = names[0] if len(names) == 1 else f"{len(names)} sequences"
-    return error_sentences({f"{item.data.name} {of}": summarise(curves)})[0]
+    sentence = first_sentences(results_of([curves], {}))[0]
+    return f"{item.data.name} {of}{sentence.removeprefix(item.data.name)}"
 
 
 def _write_view(

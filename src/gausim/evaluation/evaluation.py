@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, R
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
+from gausim.evaluation.markdown import markdown
 from gausim.evaluation.recorder import PictureRecorder
 from gausim.evaluation.references import Bounces, Reference
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
@@ -34,7 +36,6 @@ from gausim.results.curves import (
     IMAGE_ENERGY,
     IOU,
     POINT_ENERGY,
-    STATIC,
     TRACK_ERROR,
     TRUTH,
     ImageMetricInfo,
@@ -44,8 +45,8 @@ from gausim.results.curves import (
 )
 from gausim.results.diagnosis import Diagnosis
 from gausim.results.pictures import save_pictures
-from gausim.results.summary import write_summary
-from gausim.results.table import markdown
+from gausim.results.summary import entries_of, info_of, metrics_of
+from gausim.results.table import SCHEMA, STATIC, Results, save_results
 from gausim.runs.cost import CostMeter
 from gausim.runs.provenance import code_provenance, data_provenance
 from gausim.training.supervision.points import attach_points
@@ -80,6 +81,33 @@ def absent_metrics(side: int) -> dict[str, str]:
     return {metrics.LPIPS.key: reason} if reason else {}
 
 
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is measured of an object, and with what."""
+
+    data: ObjectData
+    scene: GaussianScene
+    methods: Mapping[str, Predict]
+    renderer: Renderer
+    views: list[str]
+    metrics: list[metrics.ImageMetric]
+    reference: Reference
+    look: SceneAppearance
+    attached: Tensor | None  # the kernel of every true point
+    linear: dict[str, LinearAR2]
+
+
+class _Totals:
+    """Quantities over all sequences: colour of the foreground, largest l2, costs, oscillation and bounces."""
+
+    def __init__(self, task: _Task) -> None:
+        self.max_l2 = 0.0
+        self.color = torch.zeros(4, dtype=torch.float64)  # sum of the true foreground's colours, and its pixels
+        self.costs = {name: CostMeter() for name in task.methods}
+        self.diagnosis = Diagnosis(task.data.fps)
+        self.bounces = Bounces(task.data)
+
+
 def evaluate_object(
     data: ObjectData,
     scene: GaussianScene,
@@ -101,44 +129,96 @@ def evaluate_object(
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
-    records = _chosen(data, sequences)  # before the measure, which reads the true motion of all
-    measure = _ObjectMeasure(data, scene, methods, renderer, views, flip=flip)
-    results: list[Rows] = []
-    pictures = PictureRecorder(data, records[0].name, measure.views)
+    records = _chosen(data, sequences)  # before the task, which reads the true motion of all
+    side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
+    task = _task(data, scene, methods, renderer, views, default_metrics(side, flip=flip))
+    totals, results, pictures = _Totals(task), list[Rows](), PictureRecorder(data, records[0].name, task.views)
     for record in records:
         # A separate record, so that its decoded frames are freed with it.
-        fresh = data.record(record.name)
-        results.append(measure.sequence(fresh, pictures if record is records[0] else None))
+        results.append(_sequence(task, totals, data.record(record.name), pictures if record is records[0] else None))
         if advance is not None:
             advance(record.name)
+    r, g, b = (totals.color[:3] / totals.color[3].clamp_min(1)).tolist()
+    shown = [ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in task.metrics]
     facts = ObjectFacts(
         name=data.name,
         fps=data.fps,
         sequences=tuple(r.name for r in records),
         frames=tuple(r.count for r in records),
-        views=tuple(measure.views),
-        train_views=tuple(v for v in measure.views if v in data.train_views),
+        views=tuple(task.views),
+        train_views=tuple(v for v in task.views if v in data.train_views),
         first_unseen=data.train_frames.stop,
         methods=tuple(methods),
-        metrics=(
-            *(ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in measure.metrics),
-            MASK_IOU,
-        ),
-        mean_color=measure.mean_color,
-        max_l2=measure.max_l2,
-        reference=measure.reference.name,
+        metrics=(*shown, MASK_IOU),
+        mean_color=(r, g, b),
+        max_l2=totals.max_l2,
+        reference=task.reference.name,
     )
-    return ObjectCurves(facts, _stack(results), measure.record(), pictures.finish())
+    return ObjectCurves(facts, _stack(results), _record(task, totals, absent_metrics(side)), pictures.finish())
 
 
-def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
-    """Writes metrics.json, metrics.npz, pictures.npz and table.md to ``folder``; returns the data of metrics.json."""
+def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> Results:
+    """Writes metrics.json, metrics.npz, pictures.npz and table.md to ``folder``; returns the content of metrics.json.
+
+    ``run`` is what was evaluated; its ``seed`` is that of the methods' entries.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     save_curves(folder / "metrics.npz", objects)
     save_pictures(folder / "pictures.npz", [c.pictures for c in objects if c.pictures is not None])
-    summary = write_summary(folder / "metrics.json", objects, run, provenance=code_provenance())
-    (folder / "table.md").write_text(markdown(summary))
-    return summary
+    results = results_of(objects, run)
+    save_results(folder / "metrics.json", results)
+    (folder / "table.md").write_text(markdown(results))
+    return results
+
+
+def results_of(objects: Sequence[ObjectCurves], run: dict[str, Any]) -> Results:
+    """The long table of evaluated objects."""
+    table = [entry for curves in objects for entry in entries_of(curves, run.get("seed"))]
+    infos = {curves.facts.name: info_of(curves) for curves in objects}
+    known = code_provenance()
+    return Results(SCHEMA, run=run, provenance=known, objects=infos, metrics=metrics_of(objects), table=table)
+
+
+def _task(
+    data: ObjectData,
+    scene: GaussianScene,
+    methods: Mapping[str, Predict],
+    renderer: Renderer,
+    views: Sequence[str] | None,
+    chosen: list[metrics.ImageMetric],
+) -> _Task:
+    reference, points = Reference(data, scene), data.rest_points
+    return _Task(
+        data,
+        scene,
+        methods,
+        renderer,
+        list(data.views if views is None else views),
+        chosen,
+        reference,
+        SceneAppearance.of(scene, scene.foreground),
+        None if points is None else attach_points(scene, points),
+        _linear_references(data) if reference.name == STATIC else {},
+    )
+
+
+def _record(task: _Task, totals: _Totals, absent: dict[str, str]) -> dict[str, Any]:
+    """Besides the figures: costs of every method, hashes of the data, absent metrics, oscillation, bounces."""
+    levels, footnotes = _told(task, "levels"), _told(task, "footnotes")
+    facts = {
+        "efficiency": {name: {**meter.summary(), "levels": levels[name]} for name, meter in totals.costs.items()},
+        "sources": data_provenance(task.data),
+        "absent": absent,
+        "footnotes": {name: found for name, found in footnotes.items() if found is not None},
+        "diagnosis": totals.diagnosis.summary(),
+        "bounce": totals.bounces.summary(),
+    }
+    return {key: found for key, found in facts.items() if found is not None}
+
+
+def _told(task: _Task, attribute: str) -> dict[str, Any]:
+    """An optional attribute of every method, None where it has none."""
+    return {name: getattr(predict, attribute, None) for name, predict in task.methods.items()}
 
 
 def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecord]:
@@ -159,157 +239,112 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
     return {f"linear AR(2) on true states, {m} modes": fit_linear_ar2(seen, m) for m in AR_MODES}
 
 
-class _ObjectMeasure:
-    """Figures of one object's sequences, with the quantities over all of them (mean colour, largest l2, costs)."""
+@torch.no_grad()
+def _sequence(task: _Task, totals: _Totals, record: SequenceRecord, pictures: PictureRecorder | None) -> Rows:
+    """Figures of one sequence, (F, V) and (F,) per row and metric; adds the frames to ``pictures``."""
+    trajectories = {}
+    for name, predict in task.methods.items():
+        made = totals.costs[name].predict(partial(predict, record), record.count - 1)
+        trajectories[name] = _checked(task, name, record, made)
+    truth = task.data.ground_truth(record)
+    reference = task.reference.trajectory(record, truth)
+    device = next((made.positions.device for made in trajectories.values()), reference.positions.device)
+    rows = _images(task, totals, record, trajectories, reference.to(device), pictures)
+    if truth is not None:
+        moved = {name: trajectory.to("cpu") for name, trajectory in trajectories.items()}
+        _points(task, totals, rows, {**moved, task.reference.name: reference}, truth)
+    return rows
 
-    def __init__(
-        self,
-        data: ObjectData,
-        scene: GaussianScene,
-        methods: Mapping[str, Predict],
-        renderer: Renderer,
-        views: Sequence[str] | None,
-        *,
-        flip: bool,
-    ) -> None:
-        self.data, self.scene, self.methods, self.renderer = data, scene, methods, renderer
-        self.views = list(data.views if views is None else views)
-        side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-        self.metrics, self._absent = default_metrics(side, flip=flip), absent_metrics(side)
-        self.reference, self._bounces = Reference(data, scene), Bounces(data)
-        self.look = SceneAppearance.of(scene, scene.foreground)
-        points = data.rest_points
-        self.attached = None if points is None else attach_points(scene, points)
-        self.max_l2 = 0.0
-        self._color = torch.zeros(4, dtype=torch.float64)
-        self._linear = _linear_references(data) if self.reference.name == STATIC else {}
-        self._costs = {name: CostMeter() for name in methods}
-        self._diagnosis = Diagnosis(data.fps)
 
-    def record(self) -> dict[str, Any]:
-        """Summary entries besides the figures: costs of every method, hashes of the data, absent metrics, diagnosis."""
-        levels, footnotes = self._told("levels"), self._told("footnotes")
-        facts = {
-            "efficiency": {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()},
-            "sources": data_provenance(self.data),
-            "absent": self._absent,
-            "footnotes": {name: found for name, found in footnotes.items() if found is not None},
-            "diagnosis": self._diagnosis.summary(),
-            "bounce": self._bounces.summary(),
-        }
-        return {key: found for key, found in facts.items() if found is not None}
+def _checked(task: _Task, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
+    expected, actual = (record.count, task.scene.count), tuple(trajectory.positions.shape[:2])
+    if actual != expected:
+        raise RunError(f"{name}, {record.name}: predicted (frames, kernels) = {actual}, expected {expected}.")
+    broken = ~torch.isfinite(trajectory.positions).flatten(1).all(1)
+    if broken.any():
+        raise RunError(
+            f"{name}, {record.name}: the prediction is not finite from frame {int(broken.nonzero()[0])} on. "
+            "Evaluate an earlier checkpoint, or train again with a smaller learning rate."
+        )
+    return trajectory
 
-    def _told(self, attribute: str) -> dict[str, Any]:
-        """An optional attribute of every method, None where it has none."""
-        return {name: getattr(predict, attribute, None) for name, predict in self.methods.items()}
 
-    @property
-    def mean_color(self) -> tuple[float, float, float]:
-        """Mean colour of the true foreground pixels so far; black without any."""
-        r, g, b = (self._color[:3] / self._color[3].clamp_min(1)).tolist()
-        return r, g, b
-
-    @torch.no_grad()
-    def sequence(self, record: SequenceRecord, pictures: PictureRecorder | None = None) -> Rows:
-        """Figures of one sequence, (F, V) and (F,) per row and metric; adds the frames to ``pictures``."""
-        trajectories = {}
-        for name, predict in self.methods.items():
-            made = self._costs[name].predict(partial(predict, record), record.count - 1)
-            trajectories[name] = self._checked(name, record, made)
-        truth = self.data.ground_truth(record)
-        reference = self.reference.trajectory(record, truth)
-        device = next((made.positions.device for made in trajectories.values()), reference.positions.device)
-        rows = self._images(record, trajectories, reference.to(device), pictures)
-        if truth is not None:
-            moved = {name: trajectory.to("cpu") for name, trajectory in trajectories.items()}
-            self._points(rows, {**moved, self.reference.name: reference}, truth)
-        return rows
-
-    def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
-        expected, actual = (record.count, self.scene.count), tuple(trajectory.positions.shape[:2])
-        if actual != expected:
-            raise RunError(f"{name}, {record.name}: predicted (frames, kernels) = {actual}, expected {expected}.")
-        broken = ~torch.isfinite(trajectory.positions).flatten(1).all(1)
-        if broken.any():
-            raise RunError(
-                f"{name}, {record.name}: the prediction is not finite from frame {int(broken.nonzero()[0])} on. "
-                "Evaluate an earlier checkpoint, or train again with a smaller learning rate."
-            )
-        return trajectory
-
-    def _images(
-        self,
-        record: SequenceRecord,
-        trajectories: Mapping[str, Trajectory],
-        reference: Trajectory,
-        pictures: PictureRecorder | None,
-    ) -> Rows:
-        cameras = record.cameras_of(self.views)
-        first = self._draw(reference, range(1), cameras)
-        parts: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
-        before: dict[str, Tensor] = {}
-        for frames in _chunks(record, len(self.views)):
-            recorded = record.frames(frames, self.views)
-            target, alpha = composite(recorded)
-            target, alpha = target.to(first.rgb), alpha.to(first.alpha)
-            mask = alpha > 0
-            total = target[mask].sum(0, dtype=torch.float64)
-            self._color += torch.cat((total, mask.sum()[None].double())).cpu()
-            images_of = {
-                name: self._costs[name].draw(partial(self._draw, t, frames, cameras), mask.shape[:2].numel())
-                for name, t in trajectories.items()
-            }
-            if pictures is not None:
-                pictures.add(recorded, images_of)
-            if self.reference.name == STATIC:  # one frame, drawn once
-                beside = Rendered(first.rgb.expand_as(target), first.alpha.expand_as(alpha))
-            else:
-                beside = self._draw(reference, frames, cameras)
-            every = {**images_of, self.reference.name: beside}
-            drawn = {name: shown.rgb for name, shown in every.items()}
-            self.max_l2 = max(self.max_l2, float((next(iter(drawn.values())) - target).norm(dim=-1).max()))
-            for name, shown in every.items():
-                parts[name][IOU].append(metrics.mask_iou(shown.alpha, alpha))
-                for metric in self.metrics:
-                    flat = (x.flatten(0, 1) for x in (shown.rgb, target, mask))
-                    parts[name][metric.key].append(metric.per_image(*flat).reshape(mask.shape[:2]))
-            for name, images in {**drawn, TRUTH: target}.items():
-                parts[name][IMAGE_ENERGY].append(_energy(images, before.get(name)))
-                before[name] = images[-1:]
-        return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
-
-    def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
-        """Images of the foreground on black, with colours clamped to [0, 1] as in image files."""
-        part = slice(frames.start, frames.stop)
-        state = trajectory.positions[part], trajectory.deformation_gradients[part], trajectory.rotations[part]
-        images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
-        return Rendered(images.rgb.clamp(0, 1), images.alpha)
-
-    def _points(self, rows: Rows, trajectories: Mapping[str, Trajectory], truth: GroundTruth) -> None:
-        """Adds 3D errors and energies to the rows."""
-        assert self.attached is not None
-        frames = len(truth.positions)
-        predicted = {
-            name: t.carry(truth.rest.to(t.positions), self.attached, self.scene.means).to(truth.positions)
+def _images(
+    task: _Task,
+    totals: _Totals,
+    record: SequenceRecord,
+    trajectories: Mapping[str, Trajectory],
+    reference: Trajectory,
+    pictures: PictureRecorder | None,
+) -> Rows:
+    """Image figures of every frame and view, and the image energy of the truth."""
+    cameras = record.cameras_of(task.views)
+    first = _draw(task, reference, range(1), cameras)
+    parts: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
+    before: dict[str, Tensor] = {}
+    for frames in _chunks(record, len(task.views)):
+        recorded = record.frames(frames, task.views)
+        target, alpha = composite(recorded)
+        target, alpha = target.to(first.rgb), alpha.to(first.alpha)
+        mask = alpha > 0
+        totals.color += torch.cat((target[mask].sum(0, dtype=torch.float64), mask.sum()[None].double())).cpu()
+        images = {
+            name: totals.costs[name].draw(partial(_draw, task, t, frames, cameras), mask.shape[:2].numel())
             for name, t in trajectories.items()
         }
-        displacement = truth.positions - truth.rest
-        for name, linear in self._linear.items():
-            predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
-        moving = {name: points for name, points in predicted.items() if name != self.reference.name}
-        levels = {name: found for name, found in self._told("units").items() if found}
-        parts = {name: [unit.cpu()[self.attached] for unit in units] for name, units in levels.items()}
-        self._diagnosis.add(truth.positions, truth.rest, moving, parts)
-        spread = truth.rest.amax(0) - truth.rest.amin(0)
-        diagonal = self.data.diagonal or float(spread.norm())
-        self._bounces.add({**predicted, TRUTH: truth.positions}, diagonal)
-        for name, points in {**predicted, TRUTH: truth.positions}.items():
-            row = rows.setdefault(name, {})
-            if name != TRUTH:
-                row[ERROR_3D] = metrics.point_error(points, truth.positions, diagonal).cpu().numpy()
-                row[TRACK_ERROR] = metrics.track_error(points, truth.positions).cpu().numpy()
-                row[CHAMFER] = metrics.chamfer(points, truth.positions).numpy()
-            row[POINT_ENERGY] = np.concatenate(([np.nan], metrics.motion_energy(points).cpu().numpy()))
+        if pictures is not None:
+            pictures.add(recorded, images)
+        if task.reference.name == STATIC:  # one frame, drawn once
+            images[STATIC] = Rendered(first.rgb.expand_as(target), first.alpha.expand_as(alpha))
+        else:
+            images[task.reference.name] = _draw(task, reference, frames, cameras)
+        largest = (next(iter(images.values())).rgb - target).norm(dim=-1).max()
+        totals.max_l2 = max(totals.max_l2, float(largest))
+        for name, shown in images.items():
+            parts[name][IOU].append(metrics.mask_iou(shown.alpha, alpha))
+            for metric in task.metrics:
+                flat = (x.flatten(0, 1) for x in (shown.rgb, target, mask))
+                parts[name][metric.key].append(metric.per_image(*flat).reshape(mask.shape[:2]))
+        for name, rgb in {**{name: shown.rgb for name, shown in images.items()}, TRUTH: target}.items():
+            parts[name][IMAGE_ENERGY].append(_energy(rgb, before.get(name)))
+            before[name] = rgb[-1:]
+    return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
+
+
+def _draw(task: _Task, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
+    """Images of the foreground on black, with colours clamped to [0, 1] as in image files."""
+    part = slice(frames.start, frames.stop)
+    state = trajectory.positions[part], trajectory.deformation_gradients[part], trajectory.rotations[part]
+    images = draw(task.renderer, task.look, *state, trajectory.unit_of_kernel, cameras)
+    return Rendered(images.rgb.clamp(0, 1), images.alpha)
+
+
+def _points(
+    task: _Task, totals: _Totals, rows: Rows, trajectories: Mapping[str, Trajectory], truth: GroundTruth
+) -> None:
+    """Adds 3D errors and energies to the rows."""
+    attached = task.attached
+    assert attached is not None
+    predicted = {
+        name: t.carry(truth.rest.to(t.positions), attached, task.scene.means).to(truth.positions)
+        for name, t in trajectories.items()
+    }
+    displacement = truth.positions - truth.rest
+    for name, linear in task.linear.items():
+        predicted[name] = truth.rest + linear.rollout(displacement[:2], len(truth.positions) - 1)
+    moving = {name: points for name, points in predicted.items() if name != task.reference.name}
+    units = {name: [unit.cpu()[attached] for unit in found] for name, found in _told(task, "units").items() if found}
+    totals.diagnosis.add(truth.positions, truth.rest, moving, units)
+    diagonal = task.data.diagonal or float((truth.rest.amax(0) - truth.rest.amin(0)).norm())
+    every = {**predicted, TRUTH: truth.positions}
+    totals.bounces.add(every, diagonal)
+    for name, points in every.items():
+        row = rows.setdefault(name, {})
+        if name != TRUTH:
+            row[ERROR_3D] = metrics.point_error(points, truth.positions, diagonal).cpu().numpy()
+            row[TRACK_ERROR] = metrics.track_error(points, truth.positions).cpu().numpy()
+            row[CHAMFER] = metrics.chamfer(points, truth.positions).numpy()
+        row[POINT_ENERGY] = np.concatenate(([np.nan], metrics.motion_energy(points).cpu().numpy()))
 
 
 def _chunks(record: SequenceRecord, views: int) -> Iterator[range]:

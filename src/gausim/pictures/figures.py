@@ -18,6 +18,7 @@ from gausim.io.files import replacing
 from gausim.pictures.frames import error_colors, moving_line, space_time_slice
 from gausim.results.curves import ERROR_3D, TRUTH, ObjectCurves
 from gausim.results.diagnosis import DiagnosisFigures, numbers, read_diagnosis
+from gausim.results.table import ObjectInfo
 
 _DPI = 110
 SEEN_SHADE = "#dde6ee"
@@ -210,10 +211,10 @@ def diagnosis_plot(named: Sequence[tuple[str, DiagnosisFigures, str]], *, title:
     return figure
 
 
-def diagnosis_figure(name: str, entry: Mapping[str, Any], path: Path) -> bool:
+def diagnosis_figure(name: str, info: ObjectInfo, path: Path) -> bool:
     """Writes the figure of one evaluation; returns False if it has no diagnosis."""
-    found = read_diagnosis(entry)
-    methods = [m for m in entry.get("methods", []) if found is not None and m in found.rows]
+    found = read_diagnosis(info.diagnosis, info.splits["seen"][1])
+    methods = [m for m in info.methods if found is not None and m in found.rows]
     if found is None or not methods:
         return False
     save_figure(diagnosis_plot([(m, found, m) for m in methods], title=f"{name}: motion beside the truth"), path)

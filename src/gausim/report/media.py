@@ -28,8 +28,8 @@ from gausim.pictures.frames import (
     time_line,
     timeline_bar,
 )
-from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import Study
+from gausim.report.runs import RunRecord
+from gausim.report.study import Study
 from gausim.results.curves import ObjectCurves, load_curves
 from gausim.results.diagnosis import read_diagnosis
 from gausim.results.pictures import Pictures, kept_pictures
@@ -133,7 +133,8 @@ def _motions(study: Study, name: str) -> list[Exhibit]:
     """Spectra and phase errors of the first seed of every row, if the true motion is known."""
     named = []
     for group in study.groups:
-        found = [d for _, entry in group.entries(name) if (d := read_diagnosis(entry)) and group.method in d.rows]
+        read = (read_diagnosis(info.diagnosis, info.splits["seen"][1]) for _, info in group.entries(name))
+        found = [diagnosis for diagnosis in read if diagnosis is not None and group.method in diagnosis.rows]
         named += [(group.label, found[0], group.method)] if found else []
     if not named:
         return []

@@ -2,36 +2,31 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
-from gausim.report.gather.study import Group, Study, cell, pooled
+from gausim.report.layouts import ERROR_RATIO
 from gausim.report.media import Film, make_film
-from gausim.report.tables.sheets import NOTHING
-from gausim.report.tables.verdict import NAMES, outcome, sentences
-from gausim.results.curves import ERROR_3D, STATIC
-from gausim.results.summary import MOTION_ENERGY, dig
-from gausim.results.table import Table, plus_minus, reference_row
+from gausim.report.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.study import Group, Study
+from gausim.report.verdict import NAMES, Outcome, outcome, sentences
+from gausim.results.pivot import Column, Grid, Pivot, joined
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import STATIC, ObjectInfo
 
 # Largest number of first screens, because videos make up most of a page's size.
 MOST_OPENINGS = 6
 # Largest number of rows of its table; the last is the reference.
 MOST_ROWS = 6
-# Columns: metric, views (None: those of the row), heading, digits.
+# Columns: metric, views, end of the heading.
 _COLUMNS = (
-    ("psnr", None, "PSNR [dB] ↑", 1),
-    ("ssim", None, "SSIM ↑", 3),
-    ("lpips", None, "LPIPS ↓", 3),
-    (ERROR_3D, "points", "3D error ÷ {reference} ↓", 2),
-    (MOTION_ENERGY, "points", "motion energy → 1", 2),
-)
+    ("psnr", "train", ""), ("psnr", "heldout", ", new views"), ("ssim", "train", ""), ("lpips", "train", ""),
+    (ERROR_RATIO, "points", ""), (MOTION_ENERGY, "points", ""),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +40,7 @@ class Opening:
     seed: str  # its seed, empty if there is one only
     run: RunRecord  # of the video
     sentences: tuple[str, str, str]  # over all seeds of the row
-    table: Table
+    grid: Grid | None
     film: Film | None
     problem: str  # reason for a missing video, and the remedy
     unfinished: bool  # whether the figures are of an unfinished training
@@ -66,10 +61,15 @@ def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
     """The evaluated runs of an object, sorted by error, with the best seed of every row first."""
     found = []
     for group in study.groups:
-        seeds = [(outcome([entry], group.method).merit, run) for run, entry in group.entries(name)]
+        seeds = [(_merit(run, name, group.method, info), run) for run, info in group.entries(name)]
         for place, (merit, run) in enumerate(sorted(seeds, key=lambda seed: seed[0])):
             found.append(((place, merit), (name, group, run)))
     return [shown for _, shown in sorted(found, key=lambda item: item[0])]
+
+
+def _merit(run: RunRecord, name: str, method: str, info: ObjectInfo) -> float:
+    assert run.results is not None
+    return outcome(Pivot(run.results), name, method, info).merit
 
 
 def unanswered(study: Study) -> list[str]:
@@ -84,12 +84,12 @@ def unanswered(study: Study) -> list[str]:
     return [
         remedies[run.status].format(name=run.name, detail=run.detail, path=shlex.quote(str(run.path)))
         for run in study.runs
-        if run.summary is None
+        if run.results is None
     ]
 
 
 def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
-    entries = [entry for _, entry in group.entries(name)]
+    entries = group.entries(name)
     seed = f"seed {run.seed}" if len(entries) > 1 else ""
     parts = (name if len(study.objects) > 1 else "", group.label if len(study.groups) > 1 else "", seed)
     film, problem = None, "Videos were left out (--no-pictures)."
@@ -105,103 +105,77 @@ def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures:
         row=group.label,
         seed=seed,
         run=run,
-        sentences=sentences(outcome(entries, group.method)),
-        table=first_table(study, group, name),
+        sentences=sentences(_outcome(study, group, name)),
+        grid=first_grid(study, group, name),
         film=film,
         problem=problem,
-        unfinished=any(r.is_from_unfinished for r, _ in group.entries(name)),
+        unfinished=any(r.is_from_unfinished for r, _ in entries),
     )
 
 
-def first_table(study: Study, group: Group, name: str) -> Table:
-    """The table of a first screen: frames and views of a single row, else all rows on unseen frames."""
-    rivals = [g for g in study.groups if name in g.objects]
-    table = _own_table(study, group, name) if len(rivals) == 1 else _comparison(study, rivals, name)
-    return replace(table, title=f"{table.title} {study.test}") if study.test else table
+def _outcome(study: Study, group: Group, name: str) -> Outcome:
+    return outcome(study.pivot, name, group.label, group.entries(name)[0][1], group.method)
 
 
-def _own_table(study: Study, group: Group, name: str) -> Table:
-    splits = study.splits(name)
-    known = [split for split in ("seen", "unseen") if split in splits]
-    rows = [row for split in known for row in _rows(group, name, split, f"{split} {_span(splits[split])}")]
-    last, reference = "unseen" if "unseen" in known else "seen", _reference(group, name)
-    rows += _rows(group, name, last, NAMES[reference], row=reference)
-    seeds = "± standard deviation over seeds. " if len(group.entries(name)) > 1 else ""
-    caption = (
-        f"{NAMES[reference].capitalize()}: the {reference} prediction of the {last} frames. New views: never trained "
-        f"on. {seeds}{_legend(rows, reference)}"
-    )
-    return _tidy(["frames", "views"], rows, caption, reference)
+def first_grid(study: Study, group: Group, name: str) -> Grid | None:
+    """The table of a first screen: ranges of frames of a single row, else the best rows on unseen frames."""
+    info = study.results.objects[name]
+    rivals = [g for g in study.groups if g.entries(name)]
+    splits = [split for split in ("seen", "unseen") if split in info.splits]
+    reference = info.reference if info.reference in NAMES else STATIC
+    if len(rivals) == 1:
+        grids = [_part(study, name, split, {group.label: f"{split} {_span(info.splits[split])}"}) for split in splits]
+        grids.append(_part(study, name, splits[-1], {reference: NAMES[reference]}))
+        stub = "frames"
+        caption = f"{NAMES[reference].capitalize()}: the {reference} prediction of the {splits[-1]} frames."
+    else:
+        ordered = sorted(rivals, key=lambda rival: _outcome(study, rival, name).merit)
+        labels = {rival.label: rival.label for rival in ordered[: MOST_ROWS - 1]}
+        grids, stub = [_part(study, name, splits[-1], labels | {reference: NAMES[reference]})], "method"
+        left = f" The best {len(labels)} of {len(ordered)} rows; all are below." if len(ordered) > len(labels) else ""
+        caption = f"Frames {_span(info.splits[splits[-1]])} ({splits[-1]}).{left}"
+    found = joined(grids)
+    return None if found is None else _tidy(replace(found, stub=stub), f"{caption} {_legend(info, reference)}", study)
 
 
-def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
-    splits = study.splits(name)
-    split = "unseen" if "unseen" in splits else "seen"
-
-    def merit(rival: Group) -> float:
-        entries = [entry for _, entry in rival.entries(name)]
-        return outcome(entries, rival.method).merit if entries else math.inf
-
-    ordered = sorted(rivals, key=merit)
-    shown = ordered[: MOST_ROWS - 1]
-    views = "heldout" if any(_rows(g, name, split, "")[1:] for g in shown) else "train"
-    rows = [_row(g, name, split, views, g.label) for g in shown]
-    reference = _reference(shown[0], name)
-    rows.append(_row(shown[0], name, split, views, NAMES[reference], row=reference))
-    where = "views never trained on" if views == "heldout" else "training views"
-    left = f" The best {len(shown)} of {len(ordered)} rows; all are below." if len(ordered) > len(shown) else ""
-    caption = f"Frames {_span(splits[split])} ({split}), {where}. {_legend(rows, reference)}{left}"
-    return _tidy(["method"], rows, caption, reference)
+def _part(study: Study, name: str, split: str, labels: dict[str, str]) -> Grid | None:
+    """The rows of one range of frames, with other labels."""
+    columns = []
+    for metric, views, more in _COLUMNS:
+        known = study.results.metrics.get(metric)
+        if known is not None:
+            found = study.pivot.column((name, split, views, metric), more=more)
+            columns.append(found or Column((name, split, views, metric), "", known.digits, known.better))
+    grid = study.pivot.grid(columns, rows=list(labels))
+    if grid is None:
+        return None
+    return replace(grid, lines=tuple(replace(line, label=labels[line.label]) for line in grid.lines))
 
 
-def _reference(group: Group, name: str) -> str:
-    """The row of the reference; an unknown one counts as static."""
-    found = next((reference_row(entry) for _, entry in group.entries(name)), STATIC)
-    return found if found in NAMES else STATIC
+def _tidy(grid: Grid, caption: str, study: Study) -> Grid:
+    """The grid without empty columns and deviations over sequences."""
+    kept = [i for i in range(len(grid.columns)) if any(line.cells[i] is not None for line in grid.lines)]
+    lines = [
+        replace(
+            line,
+            cells=tuple(cell and cell._replace(std=None) for cell in (line.cells[i] for i in kept)),
+            best=tuple(line.best[i] for i in kept),
+        )
+        for line in grid.lines
+    ]
+    columns = tuple(grid.columns[i] for i in kept)
+    return replace(grid, columns=columns, lines=tuple(lines), caption=f"{caption} {study.test}".strip())
 
 
 def _span(split: Sequence[int]) -> str:
     return f"{split[0]}–{split[1] - 1}"
 
 
-def _rows(group: Group, name: str, split: str, label: str, *, row: str | None = None) -> list[list[str]]:
-    """The lines of the training views and, if measured, of the held-out views."""
-    trained, new = (_row(group, name, split, views, label, row=row) for views in ("train", "heldout"))
-    lines = [[label, "training", *trained[1:]]]
-    return [*lines, ["", "new", *new[1:4], "", ""]] if any(map(_is_figure, new[1:4])) else lines
-
-
-def _row(group: Group, name: str, split: str, views: str, label: str, *, row: str | None = None) -> list[str]:
-    def ratio(entry: dict[str, Any]) -> Any:
-        return {"mean": dig(entry["rows"], row or group.method, split, "points", ERROR_3D, "ratio")}
-
-    texts = []
-    for metric, own, _, digits in _COLUMNS:
-        if metric == ERROR_3D:
-            found = pooled(group, name, ratio, metric)
-        else:
-            found = cell(group, name, split, own or views, metric, row=row)
-        value, text = found.value, found.status or NOTHING
-        texts.append(plus_minus(value.mean, None if row else value.seed_std, digits=digits) if value else text)
-    return [label, *texts]
-
-
-def _is_figure(text: str) -> bool:
-    return text[:1].isdigit() or text[:1] == "-"
-
-
-def _legend(rows: list[list[str]], reference: str) -> str:
+def _legend(info: ObjectInfo, reference: str) -> str:
     text = (
-        f"3D error: over that of {NAMES[reference]}, below 1 is better. Motion energy: predicted over true, 1 is right."
+        f"3D: error over that of {NAMES[reference]}, below 1 is better. Motion energy: predicted over true, 1 is right."
+        " ± is the deviation over seeds."
     )
-    if any(NO_WEIGHTS in row for row in rows):
+    if info.absent.get("lpips") == NO_WEIGHTS:
         text += f" LPIPS: its weights were not there; `{HOW_TO_GET_WEIGHTS}` gets them, then evaluate again."
     return text
-
-
-def _tidy(stubs: list[str], rows: list[list[str]], caption: str, reference: str) -> Table:
-    """The table without empty columns."""
-    head = [*stubs, *(heading.format(reference=reference) for _, _, heading, _ in _COLUMNS)]
-    kept = [i for i in range(len(head)) if i < len(stubs) or any(_is_figure(row[i]) for row in rows)]
-    breaks = [i for i, row in enumerate(rows) if i and (row[0] == NAMES[reference] or (len(stubs) > 1 and row[0]))]
-    return Table(caption, [head[i] for i in kept], [[row[i] for i in kept] for row in rows], breaks)

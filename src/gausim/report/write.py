@@ -6,7 +6,7 @@ import csv
 import io
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -15,19 +15,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from gausim.io.files import write_durably
 from gausim.pictures.frames import FORESEEN, SEEN
-from gausim.report.gather.runs import RunRecord, find_runs
-from gausim.report.gather.study import Group, Study, cell, counted, make_study, reference_rows
+from gausim.report.layouts import SECTIONS, grids
 from gausim.report.media import object_figures
 from gausim.report.opening import Opening, make_openings, unanswered
-from gausim.report.records.measure import measured_record
-from gausim.report.records.print import results_latex, results_page
-from gausim.report.records.record import Record
-from gausim.report.tables.overview import make_sheets
-from gausim.report.tables.sheets import SECTIONS, Sheet
+from gausim.report.render import grouped, results_latex, results_page
+from gausim.report.runs import RunRecord, find_runs
+from gausim.report.study import Study, counted, make_study
+from gausim.results.pivot import Grid, cell_texts
+from gausim.results.table import Made
 
 CSV_HEAD = (
-    "row", "kind", "object", "split", "first_frame", "end_frame", "views", "metric", "mean", "std_sequences",
-    "std_seeds", "seeds", "scale", "unit", "status", "runs", "config", "commit", "scene_sha256", "manifest_sha256",
+    "row", "kind", "object", "split", "views", "metric", "seed", "value", "deviation", "unit", "status", "runs",
+    "config", "commit", "scene_sha256", "manifest_sha256",
 )  # fmt: skip
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "results.md", "tables.tex", "numbers.csv"
 
@@ -42,24 +41,33 @@ class Report:
 
 
 class Sources:
-    """Link targets in the report for the sources of numbers.
+    """Link targets in the report for the runs that numbers come from.
 
     Attributes:
         runs: all runs.
         sets: sets of several runs from which a number was computed.
     """
 
-    def __init__(self, runs: Sequence[RunRecord], sheets: Sequence[Sheet], out: Path) -> None:
+    def __init__(self, study: Study, out: Path) -> None:
         """Collects the sources; links are relative to the report's folder ``out``."""
-        self._out, self.runs = out.resolve(), tuple(runs)
-        every = [tuple(dict.fromkeys(e.runs)) for sheet in sheets for line in sheet.lines for e in line.entries]
+        self._out, self._study, self.runs = out.resolve(), study, study.runs
+        every = [study.sources(group.label, name) for group in study.groups for name in group.objects]
         self.sets = [same for same in dict.fromkeys(every) if len(same) > 1]
-        self._anchors: dict[tuple[RunRecord, ...], str] = {(run,): f"run-{i}" for i, run in enumerate(runs, 1)}
+        self._anchors: dict[tuple[RunRecord, ...], str] = {(run,): f"run-{i}" for i, run in enumerate(self.runs, 1)}
         self._anchors |= {same: f"runs-{i}" for i, same in enumerate(self.sets, 1)}
 
     def anchor(self, runs: Sequence[RunRecord]) -> str:
         """Link target of a number computed from ``runs``; empty without runs."""
-        return self._anchors.get(tuple(dict.fromkeys(runs)), "")
+        return self._anchors.get(tuple(runs), "")
+
+    def of(self, row: str, name: str) -> str:
+        """Link target of a row's numbers of an object."""
+        return self.anchor(self._study.sources(row, name))
+
+    def missing(self, row: str, name: str, metric: str) -> str:
+        """Why a row has no figure; empty where that needs no word."""
+        group = next((group for group in self._study.groups if group.label == row), None)
+        return group.state(name, metric) if group is not None and metric in ("lpips", "flip") else ""
 
     def link(self, run: RunRecord) -> str:
         """Relative path of a run's directory."""
@@ -81,9 +89,8 @@ def write_report(
     Raises:
         RunError: a root is no directory, or there is no run.
     """
-    runs = find_runs(roots, skip=out)
-    study = make_study(runs)
-    sheets = make_sheets(study)
+    study = make_study(find_runs(roots, skip=out), title)
+    tables = grids(study)
     if pictures:
         say("videos of the runs")
     openings, left = make_openings(study, pictures=pictures)
@@ -93,27 +100,30 @@ def write_report(
         figures, problems = object_figures(study, name)
         exhibits += [(name, figures)] if figures else []
         notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]
-    shown = {"title": title, "left": left, "sources": Sources(runs, sheets, out), "exhibits": exhibits, "notes": notes}
-    written = _write(out, {PAGE: _page(study, sheets, openings, **shown), NUMBERS: csv_numbers(study)})
-    return Report(study, openings, [*written, *write_tables(out, measured_record(study, title), notes)])
+    shown = {"left": left, "sources": Sources(study, out), "exhibits": exhibits, "notes": notes}
+    written = _write(out, {PAGE: _page(study, tables, openings, **shown), NUMBERS: csv_numbers(study)})
+    return Report(study, openings, [*written, *write_tables(out, study, notes)])
 
 
-def _page(study: Study, sheets: Sequence[Sheet], openings: Sequence[Opening], **content: object) -> str:
+def _page(study: Study, tables: Sequence[Grid], openings: Sequence[Opening], **content: object) -> str:
     """The page: one HTML file without scripts or external resources, all texts escaped.
 
     ``openings`` are first screens, shown one at a time; ``content`` are further names of the template.
     """
-    sections = [(name, [sheet for sheet in sheets if sheet.section == name]) for name in SECTIONS]
+    sections = [(name, [grid for grid in tables if grid.section == name]) for name in SECTIONS]
     seen, foreseen = ("#{:02x}{:02x}{:02x}".format(*color) for color in (SEEN, FORESEEN))
     environment = Environment(
         loader=PackageLoader("gausim.report"), undefined=StrictUndefined, trim_blocks=True, autoescape=True
     )
     return environment.get_template("page.html").render(
         content,
+        title=study.results.title,
         openings=openings,
         summary=summary_line(study),
         remedies=unanswered(study),
         sections=[(name, own) for name, own in sections if own and openings],
+        grouped=grouped,
+        cell_texts=cell_texts,
         seen_color=seen,
         foreseen_color=foreseen,
     )
@@ -127,57 +137,41 @@ def summary_line(study: Study) -> str:
     return f"{counted(len(study.runs), 'run')}: {shown}; {counted(len(study.groups), 'row')}; objects: {objects}."
 
 
-def write_tables(out: Path, record: Record, notes: Sequence[str]) -> list[Path]:
-    """Writes all tables of a record as Markdown, with notes, and LaTeX."""
-    return _write(out, {MARKDOWN: results_page(record, notes), LATEX: results_latex(record)})
+def write_tables(out: Path, study: Study, notes: Sequence[str]) -> list[Path]:
+    """Writes all tables as Markdown, with notes, and LaTeX."""
+    made, tables = study.results.made or Made("unknown"), grids(study)
+    page = results_page(study.results.title, made, tables, notes)
+    return _write(out, {MARKDOWN: page, LATEX: results_latex(made, tables)})
 
 
-def _write(out: Path, texts: dict[str, str]) -> list[Path]:
+def _write(out: Path, files: dict[str, str]) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
+    for name, text in files.items():
         write_durably(out / name, text.encode("utf-8", errors="replace"))
-    return [out / name for name in texts]
+    return [out / name for name in files]
 
 
 def csv_numbers(study: Study) -> str:
-    """All figures at full precision and unscaled, one line per figure of every row; columns as in :data:`CSV_HEAD`."""
+    """The long table at full precision, a line per seed, and a line for every row without figures."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, CSV_HEAD, restval="", lineterminator="\n")
     writer.writeheader()
+    sources: dict[tuple[str, str], dict[str, str]] = {}
+    for entry in study.results.table:
+        key = entry.row, entry.object
+        if key not in sources:
+            sources[key] = _sources(study.sources(*key), entry.object)
+        own = {name: getattr(entry, name) for name in CSV_HEAD[:9]}
+        writer.writerow({**own, "unit": study.results.metrics[entry.metric].unit, **sources[key]})
     for group in study.groups:
         for name in group.objects:
-            for row in (group.method, *reference_rows([group], [name])):
-                writer.writerows(_lines(study, group, name, row))
+            if not group.entries(name):
+                status = {"row": group.label, "kind": "method", "object": name, "status": group.state(name, "")}
+                writer.writerow({**status, **_sources(group.of(name), name)})
     return stream.getvalue()
 
 
-def _lines(study: Study, group: Group, name: str, row: str) -> Iterator[dict[str, object]]:
-    is_method = row == group.method
-    line: dict[str, object] = {
-        "row": group.label if is_method else f"{row} (with {group.label})",
-        "kind": "method" if is_method else "reference", "object": name, **_sources(group, name),
-    }  # fmt: skip
-    entries = group.entries(name)
-    if not entries:
-        yield line | {"status": cell(group, name, "seen", "train", "l2").status}
-    splits = study.splits(name)
-    places = dict.fromkeys(
-        (split, views, metric) for _, entry in entries for split, by_views in entry["rows"].get(row, {}).items()
-        for views, cells in by_views.items() for metric in cells if split in splits
-    )  # fmt: skip
-    for split, views, metric in places:
-        c, info = cell(group, name, split, views, metric, row=row), study.info(metric) or {}
-        start, end = splits[split]
-        line |= {"split": split, "first_frame": start, "end_frame": end, "views": views, "metric": metric}
-        line |= {"status": c.status, "scale": info.get("scale", ""), "unit": info.get("unit", "")}
-        found = c.value
-        yield line if found is None else line | {
-            "mean": found.mean, "std_sequences": found.std, "std_seeds": found.seed_std, "seeds": len(found.seeds)
-        }  # fmt: skip
-
-
-def _sources(group: Group, name: str) -> dict[str, str]:
-    runs = [r for r, _ in group.entries(name)] or list(group.of(name))
+def _sources(runs: Sequence[RunRecord], name: str) -> dict[str, str]:
     hashes = [run.data_hashes.get(name, ["?", "?"]) for run in runs]
     columns = {
         "runs": [r.name for r in runs], "config": [r.config_hash for r in runs], "commit": [r.commit for r in runs],

@@ -18,9 +18,10 @@ import numpy as np
 from gausim.core import RunError
 from gausim.io.npz import read_npz
 from gausim.results.pictures import Pictures
+from gausim.results.table import STATIC
 
 # Rows of the references with which every table compares: of a body at rest in its pins, in flight, and in hands.
-STATIC, BALLISTIC, FOLLOW_HANDS = "static", "ballistic", "follow hands"
+BALLISTIC, FOLLOW_HANDS = "ballistic", "follow hands"
 TRUTH = "truth"
 IMAGE_ENERGY = "image_energy"
 ERROR_3D = "error_3d"

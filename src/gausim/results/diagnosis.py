@@ -21,7 +21,6 @@ from gausim.metrics.oscillation import (
     velocity_cosine,
 )
 from gausim.results.curves import TRUTH, finite
-from gausim.results.summary import dig
 
 Number = float | None
 
@@ -62,7 +61,7 @@ class Diagnosis:
             self._predicted.setdefault(name, []).append(_thin(points - rest.to(points), every))
 
     def summary(self) -> dict[str, Any] | None:
-        """The diagnosis as plain data (see :mod:`gausim.results.summary`), or None if no sequence moves."""
+        """The diagnosis as plain data (see :class:`DiagnosisFigures`), or None if no sequence moves."""
         if not self._truth or not any(np.abs(d).max() > 0 for d in self._truth):
             return None
         shapes, fraction = principal_motions(self._truth, MOTIONS)
@@ -141,13 +140,13 @@ class DiagnosisFigures(msgspec.Struct):
         return float(np.average(values[known], weights=weights[known])) if weights[known].any() else float("nan")
 
 
-def read_diagnosis(entry: Mapping[str, Any]) -> DiagnosisFigures | None:
-    """The diagnosis of an object's entry in metrics.json; None if it is missing or malformed."""
+def read_diagnosis(plain: Any, first_unseen: int) -> DiagnosisFigures | None:
+    """What :meth:`Diagnosis.summary` returned, as figures; None if it is missing or malformed."""
     try:
-        found = msgspec.convert(entry.get("diagnosis"), DiagnosisFigures)
-        found.first_unseen = msgspec.convert(dig(entry, "splits", "seen"), tuple[int, int])[1]
+        found = msgspec.convert(plain, DiagnosisFigures)
     except msgspec.ValidationError:
         return None
+    found.first_unseen = first_unseen
     size = len(found.frequency), len(found.fraction), len(found.fraction)
     sizes = {(len(m.spectrum), len(m.frequencies), len(m.dampings)) for m in found.rows.values()}
     return found if TRUTH in found.rows and sizes == {size} and all(size) else None

@@ -1,123 +1,73 @@
-"""Summary of per-frame figures for tables, and its file.
-
-``metrics.json`` (schema ``gausim.evaluation/1``)::
-
-    {"schema": "gausim.evaluation/1",
-     "run": {...},                                    what was evaluated, as the caller states it; where the data
-                                                      declare a test part, with its "part" (development or test), and of
-                                                      the test part the declared "trials" and the number of "looks"
-     "provenance": {"gausim", "torch", "python", "machine", "commit", "modified"},  of the program that evaluated
-     "objects": {NAME: {
-        "fps", "sequences", "frames", "views", "train_views", "heldout_views", "methods",
-        "reference": ROW,                             the row that ratios divide by: static, ballistic, follow hands
-        "splits": {"seen": [0, 16], "unseen": [16, 50], "unseen_near": [16, 26], "unseen_all": [16, 60]},
-        "metrics": {KEY: {"label", "scale", "unit", "higher_is_better"}},
-        "contrast": {"mean_color": [r, g, b], "norm": x, "max_l2": x},
-        "floor": {KEY: CELL},                         the reconstruction against frame 0 of every training view
-        "rows": {ROW: {SPLIT: {GROUP: {KEY: CELL}}}}, GROUP: train | heldout (views), points (3D)
-        "efficiency": {METHOD: {"seconds_per_frame": {"mean", "std"}, "frames", "seconds_per_image", "device",
-            "threads", "memory": {"kind", "peak_bytes", "added_bytes", "first_added_bytes"}, "levels": {"counts",
-            "predicted", "predictions", "kernels"}}}, memory and levels null where unknown
-        "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
-        "absent": {KEY: why},                         metrics that could not be computed
-        "horizon": {"frames": [1, 2, 5, ...], "rows": {ROW: {GROUP: {KEY: [mean, ...]}}}},   by frames ahead
-        "bounce": {ROW: {"height", "rise", "height_error", "rise_error", "depth"}},   of free bodies above a floor
-        "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
-            "peak_bytes"}, "largest_eigenvalue": x}}          fit null where it was not counted; the eigenvalue is of
-                                                      the step linearised at rest, only of simulators with a network
-        "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
-            "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
-            "level_errors": [x, ...]}}}                where the true motion is known
-     }}}
-
-A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequences (of the mean over frames and views
-of a sequence) and the mean divided by the reference row's (null for the floor and for what is better when higher). Ends
-of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
-all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
-ratio is null. Undefined numbers are null. ``footnotes`` are notes on a method and the cost of its training; a method
-that does not extrapolate repeats its fitted motion beyond the training frames. ``diagnosis`` describes motion in the
-principal motions of the truth: the fraction (``share``) of the squared displacement, ``frequencies`` and ``dampings``
-(of critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` of the
-units' centres over static's, at each level of a hierarchy, the finest first; the truth is a row. ``horizon``
-has the mean of the frame that is so many frames after the last seen one, over sequences and views. ``bounce`` is of the
-points' centre: its highest point above the floor after the first contact and above its lowest point before, the mean
-relative errors of both, and the deepest point of all below the floor [% of diagonal]; the truth is a row.
-``provenance``, ``efficiency``, ``sources``, ``absent``, ``footnotes``, ``diagnosis``, ``reference``, ``horizon`` and
-``bounce`` are not in files of earlier versions.
-"""
+"""Summary of the per-frame figures of an object: entries of the long table, and facts."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from gausim.core import RunError
-from gausim.io.files import write_json
-from gausim.io.plain_json import parse_json
 from gausim.results.curves import (
+    BALLISTIC,
     CHAMFER,
     ERROR_3D,
     IMAGE_ENERGY,
     POINT_ARRAYS,
     POINT_ENERGY,
-    STATIC,
     TRACK_ERROR,
     TRUTH,
     ObjectCurves,
     finite,
 )
+from gausim.results.diagnosis import read_diagnosis
+from gausim.results.table import INFORMED, METHOD, NO_FORESIGHT, REFERENCE, Entry, Kind, Metric, ObjectInfo
 
-# Frames after the last seen one, of the entry ``horizon``.
+# Frames after the last seen one of which errors are kept.
 AHEAD = (1, 2, 5, 10, 20, 30, 50, 100)
-SCHEMA = "gausim.evaluation/1"
+AHEAD_METRICS = (ERROR_3D, "psnr")
 MOTION_ENERGY = "motion_energy"
 # End of the shorter of the paper's two test ranges, which every READY sequence has.
 HEADLINE_STOP = 50
 # First unseen frames, where errors are still smaller than the motion.
 NEAR_FRAMES = 10
+FLOOR = "reconstruction (floor), frame 0"
+RATIO = "_ratio"
+_SCALES = {ERROR_3D: 1.0, TRACK_ERROR: 1e3, CHAMFER: 1e3}
+_WITHOUT_RATIO = (TRACK_ERROR, MOTION_ENERGY)  # the track error is the 3D error in other units
 
-_POINT_METRICS = {
-    ERROR_3D: {"label": "3D error", "scale": 1.0, "unit": "% of diagonal", "higher_is_better": False},
-    TRACK_ERROR: {"label": "track error", "scale": 1e3, "unit": "1e-3 scene units", "higher_is_better": False},
-    CHAMFER: {"label": "Chamfer distance", "scale": 1e3, "unit": "1e-3 scene units", "higher_is_better": False},
-    MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "", "higher_is_better": None},
+# Metrics that do not come from the image metrics. Memory of a fit: the most that the training process held; of a
+# prediction: what it adds, on a GPU the peak.
+METRICS = {
+    ERROR_3D: Metric("3D error", "% of diagonal", "low"),
+    TRACK_ERROR: Metric("track error", "1e-3 scene units", "low"),
+    CHAMFER: Metric("Chamfer distance", "1e-3 scene units", "low"),
+    ERROR_3D + RATIO: Metric("3D ÷ {reference}", "", "low", 3),
+    MOTION_ENERGY: Metric("motion energy", "", "one"),
+    "units": Metric("units", digits=0),
+    "fit": Metric("fit", "CPU min", digits=1),
+    "fit_wall": Metric("fit, wall", "min", digits=1),
+    "fit_memory": Metric("fit, memory", "GB", digits=1),
+    "per_frame": Metric("per frame", "s", digits=4),
+    "per_image": Metric("per image", "ms"),
+    "memory": Metric("prediction, memory", "MB", digits=1),
+    "hardware": Metric("on"),
+    "eigenvalue": Metric("largest eigenvalue", digits=4),
+    "height": Metric("highest point after the impact", "scene units", digits=3),
+    "height_error": Metric("its error", "%", "low", 1),
+    "rise": Metric("rise", "scene units", digits=3),
+    "rise_error": Metric("its error", "%", "low", 1),
+    "depth": Metric("deepest below the floor", "% of the diagonal"),
+    "velocity_cosine": Metric("first velocity, cosine", "", "high"),
+    "frequency_error": Metric("frequency error", "%", "low", 1),
+    "damping_ratio": Metric("damping / true", "", "one"),
+    "phase_seen": Metric("phase error, seen", "°", "low", 0),
+    "phase_unseen": Metric("phase error, unseen", "°", "low", 0),
+    "coarse_error": Metric("error, large parts", "", "low"),
+    "fine_error": Metric("error, small parts", "", "low"),
 }
-
-
-class _Metric(msgspec.Struct):
-    label: str
-    scale: float
-    unit: str
-    higher_is_better: bool | None
-
-
-class _Contrast(msgspec.Struct):
-    mean_color: tuple[float, float, float]
-    norm: float
-    max_l2: float
-
-
-class _Object(msgspec.Struct):
-    """The fields that tables need; files of earlier versions have no others."""
-
-    sequences: list[str]
-    splits: dict[str, tuple[int, int]]
-    metrics: dict[str, _Metric]
-    rows: dict[str, dict[str, dict[str, dict[str, dict[str, float | None]]]]]
-    methods: list[str]
-    contrast: _Contrast | None = None
-    absent: dict[str, str] = {}
-    reference: str = STATIC
-
-
-class _Summary(msgspec.Struct):
-    run: dict[str, Any]
-    objects: dict[str, _Object]
+_BOUNCE = {"height": 1.0, "height_error": 100.0, "rise": 1.0, "rise_error": 100.0, "depth": 1.0}
 
 
 def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
@@ -133,87 +83,103 @@ def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
     return splits
 
 
-def summarise(curves: ObjectCurves) -> dict[str, Any]:
-    """The entry of one object in ``metrics.json``."""
+def metrics_of(objects: Sequence[ObjectCurves]) -> dict[str, Metric]:
+    """Display of all metrics of evaluated objects."""
+    found: dict[str, Metric] = {}
+    for info in (info for curves in objects for info in curves.facts.metrics):
+        found[info.key] = Metric(info.label, info.unit, "high" if info.higher_is_better else "low")
+        if not info.higher_is_better:
+            found[info.key + RATIO] = Metric(f"{info.label} ÷ {{reference}}", "", "low", 3)
+    return found | {CHAMFER + RATIO: Metric("Chamfer ÷ {reference}", "", "low", 3)} | METRICS
+
+
+def info_of(curves: ObjectCurves) -> ObjectInfo:
+    """Facts of an evaluated object."""
+    facts, record = curves.facts, curves.record
+    notes = record.get("footnotes", {})
+    return ObjectInfo(
+        splits=frame_splits(max(facts.frames), facts.first_unseen),
+        reference=facts.reference,
+        methods=list(facts.methods),
+        sequences=list(facts.sequences),
+        frames=list(facts.frames),
+        fps=facts.fps,
+        train_views=[facts.views[i] for i in curves.view_indices("train")],
+        heldout_views=[facts.views[i] for i in curves.view_indices("heldout")],
+        mean_color=facts.mean_color,
+        max_l2=facts.max_l2,
+        sources=record.get("sources", {}),
+        absent=record.get("absent", {}),
+        notes={
+            name: [NO_FORESIGHT] * (told.get("extrapolates") is False) + list(told.get("notes", []))
+            for name, told in notes.items()
+        },
+        diagnosis=record.get("diagnosis"),
+    )
+
+
+def entries_of(curves: ObjectCurves, seed: Any = None) -> list[Entry]:
+    """All figures of an evaluated object, of methods first."""
+    facts, methods = curves.facts, curves.facts.methods
+    rows = [*methods, *(row for row in curves.rows if row not in methods)]
+    # The linear references are fitted to the true motion, and rigid flight begins again from its last seen frames.
+    kinds: dict[str, Kind] = {facts.reference: INFORMED if facts.reference == BALLISTIC else REFERENCE}
+    kinds |= {method: METHOD for method in methods}
+    found: list[Entry] = []
+
+    def add(row: str, split: str, views: str, figures: Mapping[str, tuple[Any, float | None]]) -> None:
+        kind, own = kinds.get(row, INFORMED), seed if row in methods else None
+        for metric, (value, deviation) in figures.items():
+            if isinstance(value, str) or (value is not None and math.isfinite(value)):
+                kept = None if deviation is None or not math.isfinite(deviation) else deviation
+                found.append(Entry(row, kind, facts.name, split, views, metric, own, value, kept))
+
+    for row in rows:
+        for split, views, figures in _figures(curves, row):
+            add(row, split, views, figures)
+    for row, split, views, figures in [*_floor(curves), *_motion(curves), *_bounces(curves), *_costs(curves)]:
+        add(row, split, views, figures)
+    return found
+
+
+Figures = dict[str, tuple[Any, float | None]]
+
+
+def _figures(curves: ObjectCurves, row: str) -> Iterator[tuple[str, str, Figures]]:
+    """Figures of a row: split, views, and value and deviation over sequences by metric."""
     facts = curves.facts
-    splits = frame_splits(max(facts.frames), facts.first_unseen)
-    groups = {g: curves.view_indices(g) for g in ("train", "heldout")}
-    metrics = {m.key: {key: value for key, value in vars(m).items() if key != "key"} for m in facts.metrics}
-    color = [float(c) for c in facts.mean_color]
-    return {
-        "fps": facts.fps,
-        "sequences": list(facts.sequences),
-        "frames": list(facts.frames),
-        "views": list(facts.views),
-        "train_views": [facts.views[i] for i in groups["train"]],
-        "heldout_views": [facts.views[i] for i in groups["heldout"]],
-        "methods": list(facts.methods),
-        "reference": facts.reference,
-        "splits": {name: list(split) for name, split in splits.items()},
-        "metrics": metrics | _POINT_METRICS,
-        "contrast": {"mean_color": color, "norm": math.hypot(*color), "max_l2": facts.max_l2},
-        "floor": _floor(curves, groups["train"]),
-        "rows": {row: _row(curves, row, splits, groups) for row in curves.rows},
-        "horizon": _horizon(curves, groups),
-        **curves.record,
-    }
-
-
-def _floor(curves: ObjectCurves, views: list[int]) -> dict[str, Any]:
-    reference = curves.values.get(curves.facts.reference)
-    if not views or reference is None:
-        return {}
-    frame0 = {m.key: reference[m.key][:, 0][:, views].mean(1) for m in curves.facts.metrics}
-    return {key: _cell(values) for key, values in frame0.items()}
-
-
-def _row(
-    curves: ObjectCurves, row: str, splits: dict[str, tuple[int, int]], groups: dict[str, list[int]]
-) -> dict[str, Any]:
-    """Cells of one row: split -> group -> metric; groups without data are left out."""
-    result: dict[str, Any] = {}
-    references = curves.values.get(curves.facts.reference, {})
-    without_ratio = {m.key for m in curves.facts.metrics if m.higher_is_better}  # one of decibels has no meaning
-    for split, (start, stop) in splits.items():
-        cells: dict[str, dict[str, Any]] = {}
-        for metric, values in curves.values[row].items():
-            for group, views in _places(metric, groups).items():
-                window = _window(values, start, stop, views)
+    scales = {m.key: m.scale for m in facts.metrics} | _SCALES
+    higher = {m.key for m in facts.metrics if m.higher_is_better}
+    reference = curves.values.get(facts.reference, {})
+    groups = {g: found for g in ("train", "heldout") if (found := curves.view_indices(g))}
+    own = curves.values[row]
+    last = facts.first_unseen - 1
+    ahead = {f"+{n}": (last + n, last + n + 1) for n in AHEAD if last + n < max(facts.frames)}
+    for split, span in (frame_splits(max(facts.frames), facts.first_unseen) | ahead).items():
+        for views, columns in {"points": None, **groups}.items():
+            figures: Figures = {}
+            for metric, values in own.items():
+                if (metric in POINT_ARRAYS) != (columns is None) or (split in ahead and metric not in AHEAD_METRICS):
+                    continue
+                window = _window(values, span, columns)
                 if metric in (IMAGE_ENERGY, POINT_ENERGY):
-                    true = _window(curves.values[TRUTH][metric], start, stop, views)
-                    cells.setdefault(group, {})[MOTION_ENERGY] = _energy_cell(window, true)
-                else:
-                    base = None if metric in without_ratio else references.get(metric)
-                    reference = None if base is None else _means(_window(base, start, stop, views))
-                    cells.setdefault(group, {})[metric] = _cell(_means(window), reference)
-        result[split] = cells
-    return result
+                    true = _window(curves.values[TRUTH][metric], span, columns)
+                    figures[MOTION_ENERGY] = _energy(window, true), None
+                    continue
+                mean, deviation = _moments(_means(window))
+                deviation = None if split in ahead else deviation
+                figures[metric] = mean * scales[metric], None if deviation is None else deviation * scales[metric]
+                if split not in ahead and metric not in (*higher, *_WITHOUT_RATIO) and metric in reference:
+                    base, _ = _moments(_means(_window(reference[metric], span, columns)))
+                    ratio = mean / base if base > 0 else math.nan
+                    spread = deviation * ratio / mean if deviation is not None and mean else None
+                    figures[metric + RATIO] = ratio, spread
+            yield split, views, {m: figures[m] for m in sorted(figures, key=lambda m: m == MOTION_ENERGY)}
 
 
-def _horizon(curves: ObjectCurves, groups: dict[str, list[int]]) -> dict[str, Any]:
-    """Errors by frames ahead: how far after the last seen frame a prediction still holds."""
-    last = curves.facts.first_unseen - 1
-    ahead = [n for n in AHEAD if last + n < max(curves.facts.frames)]
-    rows: dict[str, dict[str, dict[str, list[float | None]]]] = {}
-    for row in curves.rows if ahead else ():
-        found = rows.setdefault(row, {})
-        for metric, values in curves.values[row].items():
-            if metric not in (IMAGE_ENERGY, POINT_ENERGY):
-                frames = np.moveaxis(values[:, [last + n for n in ahead]], 1, 0)  # None where every sequence has ended
-                for group, views in _places(metric, groups).items():
-                    means = _means((frames if views is None else frames[..., views]).reshape(len(ahead), -1))
-                    found.setdefault(group, {})[metric] = [finite(float(mean)) for mean in means]
-    return {"frames": ahead, "rows": rows}
-
-
-def _places(metric: str, groups: dict[str, list[int]]) -> dict[str, list[int] | None]:
-    """Groups of views in which a metric is, each with its columns."""
-    return {"points": None} if metric in POINT_ARRAYS else {group: views for group, views in groups.items() if views}
-
-
-def _window(values: np.ndarray, start: int, stop: int, views: list[int] | None) -> np.ndarray:
+def _window(values: np.ndarray, span: tuple[int, int], columns: list[int] | None) -> np.ndarray:
     """(S, all other axes) of the chosen frames and views."""
-    window = values[:, start:stop] if views is None else values[:, start:stop][:, :, views]
+    window = values[:, slice(*span)] if columns is None else values[:, slice(*span)][:, :, columns]
     return window.reshape(len(values), -1)
 
 
@@ -223,58 +189,76 @@ def _means(values: np.ndarray) -> np.ndarray:
         return np.nanmean(values, axis=1)
 
 
-def _cell(values: np.ndarray, reference: np.ndarray | None = None) -> dict[str, float | None]:
+def _moments(values: np.ndarray) -> tuple[float, float | None]:
+    """Mean and deviation over sequences; no deviation of a single sequence."""
     defined = values[~np.isnan(values)]
-    mean = float(defined.mean()) if len(defined) else math.nan
-    std = float(defined.std()) if len(defined) else math.nan
-    ratio = math.nan
-    if reference is not None and not np.isnan(reference).all() and np.nanmean(reference) > 0:
-        ratio = mean / float(np.nanmean(reference))
-    return {"mean": finite(mean), "std": finite(std), "ratio": finite(ratio)}
+    return float(defined.mean()) if len(defined) else math.nan, float(defined.std()) if len(defined) > 1 else None
 
 
-def _energy_cell(predicted: np.ndarray, true: np.ndarray) -> dict[str, float | None]:
+def _energy(predicted: np.ndarray, true: np.ndarray) -> float:
+    """Predicted over true energy, all sequences together, which no single sequence at rest can spoil."""
     both = ~(np.isnan(predicted) | np.isnan(true))
-    p, t = (np.where(both, v, 0.0).sum(1) for v in (predicted, true))
-    own = np.divide(p, t, out=np.full_like(p, np.nan), where=t > 0)
-    pooled = float(p.sum() / t.sum()) if t.sum() > 0 else math.nan
-    return {**_cell(own), "ratio": None, "pooled": finite(pooled)}
+    total = float(true[both].sum())
+    return float(predicted[both].sum()) / total if total > 0 else math.nan
 
 
-def write_summary(
-    path: Path, objects: list[ObjectCurves], run: dict[str, Any], *, provenance: dict[str, Any] | None = None
-) -> dict[str, Any]:
-    """Writes ``metrics.json`` and returns its data."""
-    entries = {c.facts.name: summarise(c) for c in objects}
-    summary = {"schema": SCHEMA, "run": run, "provenance": provenance or {}, "objects": entries}
-    write_json(path, summary)
-    return summary
+Rows = Iterator[tuple[str, str, str, Figures]]
 
 
-def load_summary(path: Path) -> dict[str, Any]:
-    """Reads a ``metrics.json``.
-
-    Raises:
-        RunError: the file is missing, not JSON or of another schema, or a field of tables is missing or malformed.
-    """
-    try:
-        summary = parse_json(path.read_bytes())
-    except FileNotFoundError:
-        raise RunError(f"{path}: no such file. Write it with `gausim evaluate RUN`.") from None
-    except ValueError as error:
-        raise RunError(f"{path}: cannot be read as JSON ({error}). Run `gausim evaluate RUN` again.") from error
-    found = summary.get("schema") if isinstance(summary, dict) else None
-    if found != SCHEMA:
-        raise RunError(f"{path}: field 'schema' is {found!r}, expected {SCHEMA!r}. Run `gausim evaluate RUN` again.")
-    try:
-        msgspec.convert(summary, _Summary)
-    except msgspec.ValidationError as error:
-        raise RunError(f"{path}: {error}. Run `gausim evaluate RUN` again.") from error
-    return dict(summary)
+def _floor(curves: ObjectCurves) -> Rows:
+    """The reconstruction against frame 0 of every training view."""
+    reference, views = curves.values.get(curves.facts.reference), curves.view_indices("train")
+    if reference is not None and views:
+        metrics = [m for m in curves.facts.metrics if m.key in reference]
+        moments = {m.key: (m.scale, *_moments(reference[m.key][:, 0][:, views].mean(1))) for m in metrics}
+        yield (
+            FLOOR,
+            "seen",
+            "train",
+            {key: (scale * mean, None if std is None else scale * std) for key, (scale, mean, std) in moments.items()},
+        )
 
 
-def dig(node: Any, *keys: str) -> Any:
-    """The value in nested dictionaries under these keys; None if there is none."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node
+def _motion(curves: ObjectCurves) -> Rows:
+    """Oscillation of every row beside the truth, where that is known."""
+    found = read_diagnosis(curves.record.get("diagnosis"), curves.facts.first_unseen)
+    for row, motion in found.rows.items() if found is not None else ():
+        if row != TRUTH and found is not None:
+            levels = [math.nan if level is None else level for level in motion.level_errors or [None]]
+            values = {
+                "velocity_cosine": motion.velocity_cosine, "frequency_error": 100 * found.frequency_error(row),
+                "damping_ratio": found.damping_ratio(row), "phase_seen": found.phase(row, seen=True),
+                "phase_unseen": found.phase(row, seen=False), "coarse_error": levels[-1], "fine_error": levels[0],
+            }  # fmt: skip
+            yield row, "motion", "points", {metric: (value, None) for metric, value in values.items()}
+
+
+def _bounces(curves: ObjectCurves) -> Rows:
+    for row, found in curves.record.get("bounce", {}).items():
+        scaled = {key: None if found[key] is None else scale * found[key] for key, scale in _BOUNCE.items()}
+        yield row, "bounce", "points", {key: (value, None) for key, value in scaled.items()}
+
+
+def _costs(curves: ObjectCurves) -> Rows:
+    """Units, time and memory of every method's predictions and training."""
+    for row in curves.facts.methods:
+        cost, told = (curves.record.get(key, {}).get(row) or {} for key in ("efficiency", "footnotes"))
+        fit, memory, frame = told.get("fit") or {}, cost.get("memory") or {}, cost.get("seconds_per_frame") or {}
+        on_gpu = str(memory.get("kind")).startswith("CUDA")
+        counts = (cost.get("levels") or {}).get("counts")
+        values = {
+            "units": " → ".join(map(str, counts)) if counts else None,
+            "fit": _times(1 / 60, fit.get("cpu_seconds")),
+            "fit_wall": _times(1 / 60, fit.get("seconds")),
+            "fit_memory": _times(1e-9, fit.get("peak_bytes")),
+            "per_frame": frame.get("mean"),
+            "per_image": _times(1e3, cost.get("seconds_per_image")),
+            "memory": _times(1e-6, memory.get("peak_bytes" if on_gpu else "added_bytes")),
+            "hardware": f"{cost['device']}, {cost['threads']} threads" if "device" in cost else None,
+            "eigenvalue": told.get("largest_eigenvalue"),
+        }
+        yield row, "", "", {metric: (value, None) for metric, value in values.items()}
+
+
+def _times(scale: float, value: float | None) -> float | None:
+    return None if value is None else finite(scale * value)

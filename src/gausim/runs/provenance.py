@@ -26,7 +26,7 @@ def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
         ``gausim``, ``torch``, ``python``: versions; ``machine``: processor and GPU; ``commit``; ``modified``: whether
         tracked files of the package differ from the commit.
     """
-    versions = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    versions = {"gausim": gausim.__version__, "torch": str(str(torch.__version__)), "python": platform.python_version()}
     # A package installed inside another project's checkout is not tracked by that repository.
     tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py") is not None
     commit = _git(package, "rev-parse", "HEAD") if tracked else None

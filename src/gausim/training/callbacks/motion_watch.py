@@ -126,7 +126,7 @@ def figures(
     row["gap"] = row["error_unseen"] - row["error_seen"]
     row["energy_seen"] = _ratio(energies, slice(0, unseen - 1))
     row["energy_unseen"] = _ratio(energies, slice(unseen - 1, None))
-    read = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, unseen]}})
+    read = read_diagnosis(diagnosis.summary(), unseen)
     if read is not None:
         own = read.rows[METHOD]
         levels, (cosine,) = (numbers(v) for v in (own.level_errors[:LEVELS], [own.velocity_cosine]))

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import fmean
-from typing import Any
 
-from gausim.results.curves import BALLISTIC, ERROR_3D, FOLLOW_HANDS, STATIC
-from gausim.results.summary import MOTION_ENERGY, dig
-from gausim.results.table import footnotes_of, reference_row
+from gausim.results.curves import BALLISTIC, ERROR_3D, FOLLOW_HANDS
+from gausim.results.pivot import Pivot
+from gausim.results.summary import MOTION_ENERGY, RATIO
+from gausim.results.table import STATIC, ObjectInfo, Results
 
 # What the references predict, in words.
 NAMES = {STATIC: "no motion", BALLISTIC: "rigid flight", FOLLOW_HANDS: "the hands' motion alone"}
@@ -60,31 +59,30 @@ class Outcome:
         return math.inf if known is None else known
 
 
-def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
-    """The outcome of a method on one object, from the object's entries in ``metrics.json``, one per seed."""
+def outcome(pivot: Pivot, name: str, row: str, info: ObjectInfo, method: str | None = None) -> Outcome:
+    """The outcome of a row on an object, over its seeds; ``method`` is its name in the facts of the object."""
 
-    def mean(row: str, split: str, views: str, metric: str, key: str) -> float | None:
-        found = [dig(entry["rows"], row, split, views, metric, key) for entry in entries]
-        known = [value for value in found if value is not None]
-        return fmean(known) if known else None
+    def mean(own: str, split: str, views: str, metric: str) -> float | None:
+        return pivot.number(own, (name, split, views, metric))
 
-    reference = reference_row(entries[0])
-    unseen = entries[0]["splits"].get("unseen")
-    split = "unseen" if unseen else "seen"
-    in_3d = {mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")} != {None}
-    measured, metric = ("points", ERROR_3D) if in_3d else ("train", "l2")
+    split = "unseen" if "unseen" in info.splits else "seen"
+    start, stop = info.splits.get("unseen", (0, 0))
+    in_3d = any(mean(row, part, "points", ERROR_3D + RATIO) is not None for part in ("seen", "unseen"))
+    measured, ratio = ("points", ERROR_3D + RATIO) if in_3d else ("train", "l2" + RATIO)
+    cell = pivot.cell(row, (name, split, measured, ratio))
+    views = ("train", "heldout")
     return Outcome(
-        frames=(unseen[0], unseen[1] - 1) if unseen else None,
+        frames=(start, stop - 1) if stop else None,
         measured=measured,
-        error=mean(method, "unseen", measured, metric, "ratio"),
-        seen_error=mean(method, "seen", measured, metric, "ratio"),
-        energy=mean(method, split, measured, MOTION_ENERGY, "pooled"),
-        psnr={views: mean(method, split, views, "psnr", "mean") for views in ("train", "heldout")},
-        still_psnr={views: mean(reference, split, views, "psnr", "mean") for views in ("train", "heldout")},
-        heldout_views=tuple(entries[0].get("heldout_views", ())),
-        seeds=len(entries),
-        repeats=footnotes_of(entries[0], method).get("extrapolates") is False,
-        reference=NAMES.get(reference, reference),
+        error=mean(row, "unseen", measured, ratio),
+        seen_error=mean(row, "seen", measured, ratio),
+        energy=mean(row, split, measured, MOTION_ENERGY),
+        psnr={group: mean(row, split, group, "psnr") for group in views},
+        still_psnr={group: mean(info.reference, split, group, "psnr") for group in views},
+        heldout_views=tuple(info.heldout_views),
+        seeds=1 if cell is None else len(cell.seeds),
+        repeats=info.repeats(method or row),
+        reference=NAMES.get(info.reference, info.reference),
     )
 
 
@@ -168,3 +166,11 @@ def _gain(found: Outcome, views: str) -> str:
 def _words(scale: Sequence[tuple[float, str]], value: float) -> str:
     """The words for a figure, rounded as printed."""
     return next(words for end, words in scale if round(value, 2) < end)
+
+
+def first_sentences(results: Results) -> list[str]:
+    """One sentence per object of an evaluation on the error of its first method in unseen frames."""
+    pivot = Pivot(results)
+    return [
+        f"{name}: {sentences(outcome(pivot, name, info.methods[0], info))[0]}" for name, info in results.objects.items()
+    ]

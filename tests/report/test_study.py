@@ -4,11 +4,17 @@ from pathlib import Path
 
 import pytest
 from helpers import report_runs
-from helpers.report_runs import config, evaluate, make_curves, sheets_of, study_of, write_run
+from helpers.report_runs import config, evaluate, make_curves, study_of, write_run
 
 from gausim.core import RunError
-from gausim.report.gather.runs import find_runs
-from gausim.report.gather.study import cell
+from gausim.report.commands import joined
+from gausim.report.runs import find_runs
+from gausim.report.study import EFFECT, EFFECT_SIGMA, Study
+from gausim.results.table import Cell
+
+
+def l2(study: Study, row: str, name: str = "toy_bunny", split: str = "seen") -> Cell | None:
+    return study.pivot.cell(row, (name, split, "train", "l2"))
 
 
 def states(root: Path) -> dict[str, str]:
@@ -53,10 +59,9 @@ def test_nothing_found_says_what_to_do(tmp_path):
         ("config.yaml", "a: [", "cannot be read as YAML"),
         ("config.yaml", "- 1", "expected a mapping"),
         ("config.yaml", "a: !!python/object/apply:os.mkdir [boom]", "cannot be read as YAML"),
-        ("evaluation/metrics.json", "{", "cannot be read as JSON"),
+        ("evaluation/metrics.json", "{", "cannot be read"),
         ("evaluation/metrics.json", '{"schema": "other"}', "schema"),
-        ("evaluation/metrics.json", '{"schema": "gausim.evaluation/1", "run": {}, "objects": {"o": {}}}', "sequences"),
-        ("evaluation/metrics.json", '{"schema": "gausim.evaluation/1", "run": 3, "objects": {}}', "at `$.run`"),
+        ("evaluation/metrics.json", '{"schema": "gausim.results/1", "run": 3}', "at `$.run`"),
     ],
 )
 def test_broken_files_are_a_state_and_nothing_in_them_runs(sweep, monkeypatch, file, text, message):
@@ -119,15 +124,11 @@ def test_networks_of_one_object_each_are_one_row_beside_the_joint_one(tmp_path):
     assert [(g.label, sorted(g.objects)) for g in study.groups] == [
         ("gausim", ["one", "three", "two"]), ("gausim jointly", ["one", "three"]), ("gausim w/o mass", ["one"]),
     ]  # fmt: skip
-    full = study.groups[0]
-    values = [cell(full, name, "seen", "train", "l2").value for name in ("one", "three")]
-    assert [v.mean for v in values] == pytest.approx([3e-3, 5e-3]) and [len(v.seeds) for v in values] == [2, 2]
-    missing = cell(full, "two", "seen", "train", "l2")
-    assert missing.status == "unfinished" and [r.name for r in missing.runs] == ["two_0"]
+    values = [l2(study, "gausim", name) for name in ("one", "three")]
+    assert [v.value for v in values] == pytest.approx([3.0, 5.0]) and [len(v.seeds) for v in values] == [2, 2]
+    assert study.groups[0].state("two", "l2") == "unfinished"
+    assert [r.name for r in study.sources("gausim", "two")] == ["two_0"]
     assert not any("more than once" in note for note in study.notes)
-    tables = sheets_of(tmp_path)
-    assert tables["ablation_one_gausim"].columns == (("gausim", ("full", "jointly", "w/o mass")),)
-    assert tables["ablation_three_gausim"].columns == (("gausim", ("full", "jointly")),)
 
 
 def on_object(name, rate, **data):
@@ -156,28 +157,69 @@ def test_a_method_whose_settings_were_chosen_for_each_object_is_one_row_and_told
 
 
 def test_seeds_are_pooled_by_hand(sweep):
-    full = study_of(sweep).groups[0]
-    value = cell(full, "toy_bunny", "unseen", "train", "l2").value
-    # Means over sequences 10e-3 and 12e-3 with deviations 5e-3 and 6e-3.
-    assert value.mean == pytest.approx(11e-3) and len(value.seeds) == 2
-    assert value.std == pytest.approx(((5e-3**2 + 6e-3**2) / 2) ** 0.5)
-    assert value.seed_std == pytest.approx(2e-3 / 2**0.5)
-    energy = cell(full, "toy_bunny", "seen", "points", "motion_energy").value
-    assert energy.mean == pytest.approx((1 / 2 + 1 / 2.2) / 2) and energy.std is None
+    study = study_of(sweep)
+    cell = l2(study, "gausim", split="unseen")
+    # Means over sequences 10 and 12 with deviations 5 and 6 [1e-3].
+    assert cell.value == pytest.approx(11) and cell.seeds == pytest.approx((10, 12))
+    assert cell.std == pytest.approx(((5**2 + 6**2) / 2) ** 0.5, rel=1e-2)
+    assert cell.seed_std == pytest.approx(2**0.5)
+    energy = study.pivot.cell("gausim", ("toy_bunny", "seen", "points", "motion_energy"))
+    assert energy.value == pytest.approx((1 / 2 + 1 / 2.2) / 2) and energy.std is None
+    static = l2(study, "static", split="unseen")  # no seed changes it
+    assert static.seeds == pytest.approx((40,)) and static.seed_std is None
+
+
+def test_the_size_of_an_ablation_is_told_against_the_spread_of_seeds(sweep):
+    evaluate(write_run(sweep / "no_mass" / "seed_1", config(1, conserve_mass=False)), make_curves(1.7))
+    study = study_of(sweep)
+    place = "toy_bunny", "unseen", "train"
+    effect = [study.pivot.number("gausim w/o mass", (*place, metric)) for metric in (EFFECT, EFFECT_SIGMA)]
+    # Means 11 and 16, deviations over two seeds the square root of 2 each: a difference of 5 in units of that.
+    assert effect == pytest.approx([100 * 5 / 11, 5 / 2**0.5])
+    assert study.pivot.number("gausim", (*place, EFFECT)) is None
 
 
 def test_why_there_is_no_number(sweep):
-    groups = study_of(sweep).groups
-    found = [cell(g, "toy_bunny", "seen", "train", "l2") for g in groups]
-    assert [c.status for c in found] == ["evaluated", "evaluated", "unfinished", "failed"]
-    assert [r.name for r in found[3].runs] == ["no_hierarchy/seed_0"]
-    assert cell(groups[0], "toy_bunny", "seen", "train", "lpips").status == "no weights"
+    study = study_of(sweep)
+    assert [l2(study, g.label) is None for g in study.groups] == [False, False, True, True]
+    assert [g.state("toy_bunny", "l2") for g in study.groups][2:] == ["unfinished", "failed"]
+    assert [r.name for r in study.sources("gausim w/o hierarchy", "toy_bunny")] == ["no_hierarchy/seed_0"]
+    assert study.groups[0].state("toy_bunny", "lpips") == "no weights"
+    assert study.groups[0].state("toy_bunny", "flip") == "not measured" and study.groups[0].state("else", "l2") == ""
     # Of seeds that all lack the number, the worst state is shown.
     failed = write_run(sweep / "no_momentum" / "seed_1", config(1, conserve_momentum=False), finished=False)
     (failed / "FAILED").write_text("")
     (group,) = [g for g in study_of(sweep).groups if g.variation == "w/o momentum"]
-    assert cell(group, "toy_bunny", "seen", "train", "l2").status == "failed" and len(group.runs) == 2
-    assert cell(groups[0], "toy_bunny", "seen", "train", "flip").status == "not measured"
+    assert group.state("toy_bunny", "l2") == "failed" and len(group.runs) == 2
+
+
+def test_runs_that_take_over_from_runs_of_other_seeds_or_objects_are_one_row(tmp_path):
+    for name, error in (("toy_bunny", 1.0), ("toy_cube", 2.0)):
+        for seed in (0, 1):
+            own = config(seed) | {"data": {"root": "/data/toy", "names": [name], "seed": seed}}
+            own |= {"model": {"method": {"_target_": "physgaussian"}}, "init_from": f"out/{name}/seed_{seed}"}
+            run = write_run(tmp_path / name / f"seed_{seed}", own, model="physgaussian")
+            evaluate(run, make_curves(error + seed, name=name))
+    study = study_of(tmp_path)
+    assert [group.label for group in study.groups] == ["physgaussian"]
+    assert [l2(study, "physgaussian", name).value for name in study.objects] == pytest.approx([3.0, 5.0])
+
+
+def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs():
+    start = "gausim train experiment=tables/comparison"
+    jobs = [f"{start} method={m} seed={s} ++plan.clock=cpu paths.output_root=/x" for m in "ab" for s in (0, 1)]
+    jobs += [f"{start} method=c seed=0 ++plan.clock=cpu paths.output_root=/x", "gausim train model=m init_from=o/r"]
+    assert joined(jobs) == [
+        f"gausim train -m {start[13:]} method=a,b seed=0,1 plan.clock=cpu",
+        f"gausim train {start[13:]} method=c seed=0 plan.clock=cpu",
+        "gausim train model=m init_from=o/r",
+    ]
+    assert joined(
+        ["gausim train -m 'data.sequences=[a,b]' seed=0,1", "gausim train 'data.sequences=[a,b]' seed=2"]
+    ) == ["gausim train -m 'data.sequences=[a,b]' seed=0,1,2"]
+    assert joined(["gausim train paths.output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
+        "gausim train init_from=outputs/run", "not recorded",
+    ]  # fmt: skip
 
 
 def test_what_makes_runs_incomparable_is_noted(tmp_path):

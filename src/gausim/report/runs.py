@@ -18,7 +18,7 @@ import yaml
 
 from gausim.core import RunError
 from gausim.io.files import natural, read_yaml
-from gausim.results.summary import dig, load_summary
+from gausim.results.table import ObjectInfo, Results, load_results
 from gausim.runs.comparison import flatten
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
 
@@ -47,7 +47,7 @@ class RunRecord:
     detail: str  # explanation of the status, for display
     config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty if unreadable
     choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
-    summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
+    results: Results | None = field(default=None, repr=False)  # content of evaluation/metrics.json
     command: str = NOT_RECORDED  # by which it was trained, of a sweep that of the whole
 
     @property
@@ -61,9 +61,14 @@ class RunRecord:
         return self.config.get("seed", "?")
 
     @property
-    def objects(self) -> dict[str, dict[str, Any]]:
-        """Its evaluation's entries by object."""
-        return (self.summary or {}).get("objects", {})
+    def objects(self) -> dict[str, ObjectInfo]:
+        """Facts of its evaluated objects."""
+        return self.results.objects if self.results is not None else {}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What was evaluated: epoch and updates of the checkpoint, part of the data, trials and looks."""
+        return self.results.run if self.results is not None else {}
 
     @cached_property
     def settings(self) -> dict[str, str]:
@@ -94,36 +99,30 @@ class RunRecord:
     @property
     def checkpoint(self) -> str:
         """Epoch and updates of the evaluated checkpoint, or ``?``."""
-        state = (self.summary or {}).get("run", {})
-        return "?" if state.get("epoch") is None else f"epoch {state['epoch']}, {state.get('updates')} updates"
-
-    @property
-    def part(self) -> tuple[str | None, Any, Any]:
-        """Evaluated part of the data (None: no test part is declared), declared trials, and looks at the test part."""
-        state = (self.summary or {}).get("run", {})
-        return state.get("part"), state.get("trials"), state.get("looks")
+        epoch = self.state.get("epoch")
+        return "?" if epoch is None else f"epoch {epoch}, {self.state.get('updates')} updates"
 
     @property
     def commit(self) -> str:
         """Commit of the program that evaluated it, with ``+`` if modified; else its version; else ``?``."""
-        commit, version = (dig(self.summary, "provenance", key) for key in ("commit", "gausim"))
-        if isinstance(commit, str):
-            return commit[:_DIGITS] + ("+" if dig(self.summary, "provenance", "modified") else "")
-        return f"gausim {version}" if isinstance(version, str) else "?"
+        known = self.results.provenance if self.results is not None else {}
+        if isinstance(commit := known.get("commit"), str):
+            return commit[:_DIGITS] + ("+" if known.get("modified") else "")
+        return f"gausim {known['gausim']}" if isinstance(known.get("gausim"), str) else "?"
 
     @property
     def data_hashes(self) -> dict[str, list[str]]:
         """First digits of the hashes of every object's scene and manifest, or ``?`` if not recorded."""
         files = ("scene", "manifest")
         return {
-            name: [(dig(entry, "sources", file, "sha256") or "?")[:_DIGITS] for file in files]
-            for name, entry in self.objects.items()
+            name: [str(dig(info.sources, file, "sha256") or "?")[:_DIGITS] for file in files]
+            for name, info in self.objects.items()
         }
 
     @property
     def is_from_unfinished(self) -> bool:
         """Whether its figures are of an unfinished training."""
-        return self.summary is not None and self.summary["run"].get("finished") is False
+        return self.state.get("finished") is False
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
@@ -185,12 +184,12 @@ def _read_run(folder: Path, name: str) -> RunRecord:
     if not metrics.is_file():
         return made(*_state(folder, is_run), config)
     try:
-        summary = load_summary(metrics)
-    except (RunError, OSError) as error:
+        results = load_results(metrics)
+    except RunError as error:
         return made(BROKEN, str(error), config)
-    unfinished = summary["run"].get("finished") is False
+    unfinished = results.run.get("finished") is False
     detail = f"measured before it was finished, {_progress(folder)}" if unfinished else ""
-    return made(EVALUATED, detail, config, summary=summary)
+    return made(EVALUATED, detail, config, results=results)
 
 
 def _command(folder: Path, job: dict[str, Any]) -> str:
@@ -231,3 +230,10 @@ def _progress(folder: Path) -> str:
     except (OSError, csv.Error):
         rows = []
     return f"epoch {rows[-1].get('epoch')}" if rows else "no epoch done"
+
+
+def dig(node: Any, *keys: str) -> Any:
+    """The value in nested dictionaries under these keys; None if there is none."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node

@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-from gausim.report.gather.runs import INIT_FROM, RunRecord
-from gausim.results.summary import dig
+from gausim.report.runs import INIT_FROM, RunRecord, dig
 
 T = TypeVar("T")
 FULL = "full"

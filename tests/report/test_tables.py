@@ -1,0 +1,370 @@
+"""Tables of reports, their files, pages made from records, and the figures of the repository's own pages."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import yaml
+from helpers.report_runs import config, evaluate, grids_of, make_curves, page_of, shown, study_of, write_run
+
+from gausim.cli import main as cli
+from gausim.core import RunError
+from gausim.report.layouts import summary
+from gausim.report.opening import first_grid
+from gausim.report.paper import CONTRAST, TABLES, paper_object
+from gausim.report.render import page
+from gausim.report.runs import find_runs
+from gausim.report.study import Study
+from gausim.report.verdict import outcome, sentences
+from gausim.results.pivot import Pivot, cell_texts, markdown_table
+from gausim.results.table import SCHEMA, Cell, Entry, Made, Metric, ObjectInfo, Results, load_results, save_results
+
+ROOT = Path(__file__).resolve().parents[2]
+HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
+BOUNCE = {"height": 0.5, "rise": 0.2, "height_error": 0.1, "rise_error": 0.25, "depth": 0.3}
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+# Commands of LaTeX itself and of the packages that the file's first line asks for.
+KNOWN = {
+    "begin", "end", "centering", "caption", "label", "textbf", "linewidth", "width", "ifdim", "else", "fi", "pm",
+    "times", "to", "uparrow", "downarrow", "sigma", "div", "multicolumn", "circ",  # LaTeX
+    "textbackslash", "textasciitilde", "textasciicircum", "textless", "textgreater", "textbar", "textquotedbl",  # T1
+    "toprule", "midrule", "bottomrule", "resizebox",  # booktabs, graphicx
+}  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------------------------- pivot
+
+
+def table_of(*entries: Entry, **metrics: Metric) -> Results:
+    return Results(SCHEMA, "Title", made=Made("2026-01-01", ["abc"], ["gausim train"]), objects={"o": ObjectInfo()},
+                   metrics=metrics, table=list(entries), facts={"minutes": 0.5, "of": "6"})  # fmt: skip
+
+
+def entry(row: str, metric: str, value: float | str, seed: int = 0, kind: str = "method", std: float | None = None):
+    return Entry(row, kind, "o", "", "", metric, seed, value, std)  # type: ignore[arg-type]
+
+
+def test_figures_as_printed() -> None:
+    metrics = {
+        "low": Metric("low", "", "low", 1), "one": Metric("one", "", "one"), "stored": Metric("as stored", digits=None),
+        "high": Metric("high", "", "high"),
+    }  # fmt: skip
+    entries = [
+        entry("a", "low", 1.24), entry("a", "one", 1.2), entry("a", "stored", 0.0001), entry("a", "high", 0.4),
+        entry("a", "high", 0.6, 1), entry("b", "low", 1.16), entry("b", "one", 0.8), entry("b", "stored", 12345.0),
+        entry("b", "high", 0.75, 0, std=0.125), entry("b", "high", 0.75, 1, std=0.125), entry("c", "low", 0.0),
+        entry("c", "stored", "6 to 7"), entry("truth", "low", -1.0, kind="informed"),
+        entry("truth", "one", 1.0, kind="informed"), entry("truth", "high", 9.0, kind="informed"),
+    ]  # fmt: skip
+    pivot = Pivot(table_of(*entries, **metrics))
+    grid = pivot.grid(pivot.column(("o", "", "", metric)) for metric in metrics)
+    assert markdown_table(grid).splitlines()[2:] == [
+        "| a | 1.2 | **1.20** | 0.0001 | 0.50 ± 0.14 |",
+        "| b | 1.2 | **0.80** | 12,345 | **0.75 ± 0.00 (± 0.12)** |",
+        "| c | **0** | | 6 to 7 | |",
+        "| truth | -1.0 | 1.00 | | 9.00 |",
+    ]
+    assert cell_texts(Cell(1.5, (1.0, 2.0), 0.7, 0.1), 1) == ("1.5", "± 0.7 (± 0.1)")
+
+
+def test_pages_name_records(tmp_path: Path) -> None:
+    results = table_of(entry("a | x", "l2", 1.0), l2=Metric("l2", digits=1))
+    save_results(tmp_path / "mine.json", results)
+    assert load_results(tmp_path / "mine.json") == results
+    call = 'table("mine", "o", stub="row | kind")'
+    template = (
+        f'## A {{#a}}\n{{{{ mine.minutes }}}} of {{{{ mine.of }}}}\n\n{{{{ {call} }}}}\n\n{{{{ made("mine") }}}}\n'
+    )
+    (tmp_path / "page.md").write_text(template)
+    text = page(tmp_path)
+    assert "## A {#a}\n0.5 of 6\n" in text and "| a | x | 1.0 |" in text and "| row | kind | l2 |" in text
+    assert "Made by (abc; recorded 2026-01-01)" in text and "\n    gausim train\n" in text
+    results.made.test = "Looked at once."
+    save_results(tmp_path / "mine.json", results)
+    assert page(tmp_path) == text.replace("Made by (", "Looked at once.\n\nMade by (")
+    for wrong, message in (
+        ("table('mine', 'u')", "no object 'u'"),
+        ("table('no', 't')", "record 'no', expected one of"),
+        ("mine.hours", "cannot be made into a page"),
+        ("table('mine', 'o', 'ahead')", "no figures"),
+    ):
+        (tmp_path / "page.md").write_text(f"{{{{ {wrong} }}}}")
+        with pytest.raises(RunError, match=message):
+            page(tmp_path)
+    (tmp_path / "mine.json").write_text("{}")
+    with pytest.raises(RunError, match=r"mine\.json: field 'schema' is None, .*gausim report DIR --record"):
+        page(tmp_path)
+
+
+# ---------------------------------------------------------------------------------------------------------- of a sweep
+
+
+def test_the_papers_table(sweep: Path) -> None:
+    grid = grids_of(sweep)["l2 [1e-3] ↓, training views"]
+    assert [(c.group, c.label) for c in grid.columns] == [("toy_bunny", s) for s in ("Seen", "Unseen 34", "Unseen 44")]
+    assert shown(grid) == {
+        "gausim": ["2.20 ± 0.28 (± 1.10)*", "11.00 ± 1.41 (± 5.52)*", "11.00 ± 1.41 (± 5.52)*"],
+        "gausim w/o mass": ["3.00 (± 1.50)", "15.00 (± 7.50)", "15.00 (± 7.50)"],
+        "static": ["8.00 (± 4.00)", "40.00 (± 20.00)", "40.00 (± 20.00)"],
+        "reconstruction (floor), frame 0": ["8.00 (± 4.00)", "", ""],
+        "DreamGaussian4D (paper)": ["1.21 (± 0.11)", "3.10 (± 0.63)", ""],
+        "PhysDreamer (paper)": ["4.77 (± 0.45)", "3.62 (± 0.31)", ""],
+        "GausSim (paper)": ["1.15 (± 0.12)", "2.47 (± 0.40)", ""],
+    }
+    kinds = ["method"] * 2 + ["reference", "informed"] + ["paper"] * 3
+    assert [line.kind for line in grid.lines] == kinds
+
+
+def test_better_may_be_higher_or_nearer_to_one_and_ties_are_all_best(sweep: Path, tmp_path: Path) -> None:
+    found = grids_of(sweep)
+    for title in ("SSIM [1e-1] ↑, training views", "motion energy, 3D, true points"):
+        assert {line.label for line in found[title].lines if line.best[0]} == {"gausim"}
+    for name in ("a", "b"):
+        evaluate(write_run(tmp_path / "two" / name, config(name=name)), make_curves(1.0))
+    assert [line.best[0] for line in grids_of(tmp_path / "two")["l2 [1e-3] ↓, training views"].lines[:2]] == [True] * 2
+
+
+def test_the_comparison_has_costs_and_every_method_its_notes(sweep: Path) -> None:
+    grid = grids_of(sweep)["toy_bunny, frames 16..49 (unseen)"]
+    assert [column.label for column in grid.columns] == [
+        "l2 [1e-3]", "SSIM [1e-1]", "3D ÷ static", "motion energy", "units", "fit [CPU min]", "fit, memory [GB]",
+        "per frame [s]", "prediction, memory [MB]",
+    ]  # fmt: skip
+    rows = shown(grid)
+    assert rows["gausim"][4:] == ["200 → 20 → 4", "1.1 ± 0.1", "1.5 ± 0.0", "0.0110 ± 0.0014", "3.3 ± 0.4"]
+    assert rows["static"][2:] == ["1.000 (± 0.500)", "0", *[""] * 5]
+
+
+def test_ablations_stand_beside_the_full_model(sweep: Path) -> None:
+    grid = grids_of(sweep)["toy_bunny, ablations of gausim"]
+    assert [column.label for column in grid.columns] == [
+        "l2 [1e-3], seen", "l2 [1e-3], unseen", "l2 [1e-3], new view, unseen", "3D ÷ static, seen",
+        "3D ÷ static, unseen", "motion energy, unseen", "l2, unseen, against full [%]", "the same [σ]",
+    ][: len(grid.columns)]  # fmt: skip
+    assert [line.label for line in grid.lines] == ["gausim", "gausim w/o mass"]
+    assert shown(grid)["gausim w/o mass"][6] == "36.4"
+
+
+def test_errors_by_frames_ahead_are_a_table(sweep: Path) -> None:
+    grid = grids_of(sweep)["toy_bunny, 3D error [% of the diagonal] by frames after the last seen one"]
+    assert [column.label for column in grid.columns] == ["+1", "+2", "+5", "+10", "+20", "+30"]
+    # l2 of 1e-3 and 3e-3, five times that in unseen frames, of the two seeds 1 and 1.2 times that.
+    assert shown(grid)["gausim"][0] == "1.10 ± 0.14*" and shown(grid)["static"][0] == "4.00"
+
+
+def test_several_objects_have_a_summary(sweep: Path) -> None:
+    assert summary(study_of(sweep).pivot) is None
+    run = write_run(sweep / "other", config() | {"data": {"root": "/data/toy", "names": ["toy_cube"], "seed": 0}})
+    evaluate(run, make_curves(2.0, name="toy_cube"))
+    grid = summary(study_of(sweep).pivot)
+    names = ("toy_bunny", "toy_cube")
+    assert [c.label for c in grid.columns] == [f"{n}: {w}" for n in names for w in ("l2 [1e-3]", "3D ÷ static")]
+    full = next(row for row in shown(grid).values() if all(row))
+    assert [text.rstrip("*") for text in full[::2]] == ["11.00", "20.00"]
+
+
+def test_the_papers_own_figures() -> None:
+    assert paper_object("bunny_ready") == "bunny" and paper_object("Pudding-soft") == "pudding"
+    assert paper_object("bunnyhop") is None and paper_object("cat") is None
+    assert TABLES["l2"]["GausSim (paper)"]["mothorchids"] == ((1.78, 0.23), (1.85, 0.14))
+    # Sums of all means and of all deviations of each table, taken from the paper's own source.
+    sums = {"l2": (136.28, 21.2), "ssim": (296.18, 0.27), "lpips": (68.25, 5.24)}
+    for metric, expected in sums.items():
+        pairs = [pair for by_object in TABLES[metric].values() for both in by_object.values() for pair in both]
+        assert len(pairs) == 30 and [sum(p[i] for p in pairs) for i in (0, 1)] == pytest.approx(expected)
+    assert all(abs(sum(c * c for c in color) ** 0.5 - norm) < 0.05 for color, norm, _ in CONTRAST.values())
+
+
+# -------------------------------------------------------------------------------- bodies that fall or are in hands
+
+
+def falling_study(root: Path, reference: str = "ballistic") -> Study:
+    for seed, error in ((0, 1.0), (1, 2.0)):
+        made = make_curves(error)
+        made.values[reference] = made.values.pop("static")
+        rows = {"gausim": {**BOUNCE, "height": 0.4 + 0.1 * seed}, reference: {**BOUNCE, "rise": None},
+                "truth": {**BOUNCE, "height_error": 0.0, "rise_error": 0.0}}  # fmt: skip
+        made.record["bounce"] = rows
+        run = write_run(root / f"seed_{seed}", config(seed))
+        evaluate(run, replace(made, facts=replace(made.facts, reference=reference)))
+    return study_of(root)
+
+
+def test_bounces_of_methods_references_and_the_truth(tmp_path: Path) -> None:
+    falling_study(tmp_path)
+    rows = shown(grids_of(tmp_path)["toy_bunny, bounce"])
+    assert rows["gausim"] == ["0.450 ± 0.071", "10.0 ± 0.0", "0.200 ± 0.000", "25.0 ± 0.0", "0.30 ± 0.00"]
+    assert rows["ballistic"][2] == "" and rows["truth"][1] == "0"
+
+
+@pytest.mark.parametrize(
+    ("reference", "words"),
+    [("ballistic", "rigid flight"), ("follow hands", "the hands' motion alone"), ("static", "no motion")],
+)
+def test_sentences_and_first_table_name_the_reference(tmp_path: Path, reference: str, words: str) -> None:
+    study = falling_study(tmp_path, reference)
+    (group,) = study.groups
+    info = study.results.objects["toy_bunny"]
+    assert f"a model that predicts {words}" in sentences(outcome(study.pivot, "toy_bunny", "gausim", info))[0]
+    grid = first_grid(study, group, "toy_bunny")
+    assert f"3D ÷ {reference}" in [column.label for column in grid.columns]
+    assert [line.label for line in grid.lines] == ["seen 0–15", "unseen 16–49", words] and words in grid.caption
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+class Page(HTMLParser):
+    """Checks that tags nest, and collects what matters."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open, self.links, self.bold = list[str](), list[str](), list[str]()
+        self.tags, self.anchors, self.text = set[str](), set[str](), ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        for key, value in attrs:
+            assert not key.startswith("on"), (tag, key)
+            if key in ("href", "src"):
+                self.links.append(value or "")
+            if key == "id":
+                self.anchors.add(value)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if self.open and self.open[-1] == "b":
+            self.bold.append(data)
+
+
+def test_the_page_stands_alone_and_every_number_leads_to_its_run(sweep: Path) -> None:
+    text = page_of(sweep, pictures=False)
+    found = Page(text)
+    assert "default-src 'none'" in text and "script" not in found.tags and "http-equiv" in text
+    assert not re.search(r"https?:|//[a-z]|url\(|@import", re.sub(r"data:[^\"]+", "", text))
+    for link in found.links:
+        assert link.startswith(("#", "data:", "../")), link
+        assert not link.startswith("#") or link[1:] in found.anchors, link
+        assert not link.startswith("../") or (sweep / "report" / link).exists(), link
+    assert "11.00" in found.bold and "15.00" not in found.bold and found.links.count("#runs-1") > 10
+    assert "c0ffeec0ffee" in found.text and "da7ada7ada7a" in found.text and "5ce7e5ce7e5c" in found.text
+    assert "conserve_mass: false" in found.text and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in found.text
+    markdown = (sweep / "report" / "results.md").read_text()
+    for block in re.findall(r"(?:^\|.*\n)+", markdown, re.M):
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1, block
+
+
+def test_csv_is_the_long_table(sweep: Path) -> None:
+    page_of(sweep, pictures=False)
+    rows = list(csv.DictReader(io.StringIO((sweep / "report" / "numbers.csv").read_text())))
+    stored = load_results(sweep / "no_mass" / "seed_0" / "evaluation" / "metrics.json").table
+    own = {(r["split"], r["views"], r["metric"]): r["value"] for r in rows if r["row"] == "gausim w/o mass"}
+    for e in stored:
+        if e.row == "gausim":
+            assert own.pop((e.split, e.views, e.metric)) == str(e.value)
+    assert {metric for _, _, metric in own} <= {"l2_effect", "l2_effect_sigma"}
+    full = [r for r in rows if (r["row"], r["split"], r["views"], r["metric"]) == ("gausim", "seen", "train", "l2")]
+    assert [r["seed"] for r in full] == ["0", "1"] and full[0]["runs"] == "full/seed_0;full/seed_1"
+    assert full[0]["unit"] == "1e-3" and full[0]["commit"] == "c0ffeec0ffee"
+    assert {r["status"] for r in rows if r["row"] == "gausim w/o hierarchy"} == {"failed"}
+
+
+def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in sweep.rglob(".hydra/hydra.yaml"):
+        hydra = yaml.safe_load(path.read_text())
+        own = [f"seed={path.parents[1].name[-1]}", "experiment=tables/ablations", "data.names=[a]"]
+        hydra["hydra"] |= {"mode": "MULTIRUN", "overrides": {"task": own}}
+        path.write_text(yaml.safe_dump(hydra))
+    words = ["experiment=tables/ablations", "seed=0,1", "data.names=[a]"]
+    (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": words}}}))
+    out = sweep.parent / "results"
+    assert cli.main(["report", str(sweep), "--results", str(out), "--record", str(out / "sweep.json")]) == 0
+    assert "tables: file://" in (said := capsys.readouterr().out) and "record: file://" in said
+    text = (out / "results.md").read_text()
+    command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
+    assert r"* Without figures: no\_hierarchy/seed\_0 (failed)" in text
+    assert f"* Command: `{command}`" in text and "* Commits: c0ffeec0ffee" in text and "* Hardware: " in text
+    assert "| gausim | **11.00 ± 1.41 (± 5.52)** |" in text
+    record = load_results(out / "sweep.json")
+    assert record.table == study_of(sweep).results.table and record.objects["toy_bunny"].sources == {}
+    assert f"% Command: {command}" in (out / "tables.tex").read_text()
+    # Another sweep of the same name has taken the place of the first.
+    (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": [*words, "model=other"]}}}))
+    commands = {run.command for run in find_runs([sweep / "full"])}
+    assert commands == {f"gausim train seed={i} experiment=tables/ablations 'data.names=[a]'" for i in (0, 1)}
+    assert cli.main(["report", str(sweep / "no_hierarchy"), "--results", str(out)]) == 2
+    assert "no run here is evaluated" in capsys.readouterr().err
+    assert cli.main(["report", "--results", str(out)]) == 2
+    assert "DIR: expected run directories" in capsys.readouterr().err
+
+
+def check_latex(text: str) -> None:
+    """What TeX would refuse: unknown commands, groups and environments that do not nest, specials as text."""
+    body = re.sub(r"(?m)(?<!\\)%.*$", "", text)
+    assert set(re.findall(r"\\([A-Za-z]+)", re.sub(r"\\\\", "", body))) <= KNOWN
+    bare = re.sub(r"\\[&%$#_{}\\]", "", body)  # without what is escaped
+    depth, environments = 0, []
+    for brace, kind, name in re.findall(r"([{}])|\\(begin|end)(?=\{(\w+))", bare):
+        depth += {"{": 1, "}": -1}.get(brace, 0)
+        assert depth >= 0
+        if kind == "begin":
+            environments.append(name)
+        elif kind:
+            assert environments.pop() == name
+    assert depth == 0 and environments == []
+    assert not set("$^_#~%") & set(re.sub(r"\$[^$\n]*\$", "", bare))
+    assert "&" not in re.sub(r"\\begin\{tabular\}.*?\\end\{tabular\}", "", bare, flags=re.S)
+
+
+def test_latex_nests_is_escaped_and_fills_its_columns(sweep: Path) -> None:
+    evaluate(write_run(sweep / "other", config(name=HOSTILE), model=None), make_curves(2.0, name=HOSTILE))
+    page_of(sweep, pictures=False)
+    latex = (sweep / "report" / "tables.tex").read_text()
+    check_latex(latex)
+    assert "etc/passwd" in latex  # the hostile name is there, as text
+    assert not [c for c in re.sub(r"(?m)(?<!\\)%.*$", "", latex) if ord(c) > 126]
+    tables = re.findall(r"\\begin\{tabular\}\{(lc+)\}\n(.*?)\\end\{tabular\}", latex, re.S)
+    assert len(tables) == latex.count(r"\begin{table*}") == latex.count(r"\caption{") > 6
+    for columns, table in tables:
+        rows = [r for r in table.splitlines() if not r.endswith("rule") and "multicolumn" not in r]
+        assert all(row.endswith(r" \\") and len(re.split(r"(?<!\\)&", row)) == len(columns) for row in rows)
+    labels = re.findall(r"\\label\{(.*?)\}", latex)
+    assert len(set(labels)) == len(labels) and all(re.fullmatch(r"tab:[A-Za-z0-9-]+", label) for label in labels)
+    assert r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
+
+
+# ---------------------------------------------------------------------------------------- the repository's own figures
+
+
+def test_the_page_of_results_is_what_its_records_give() -> None:
+    assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results"), "run `make results`"
+
+
+def test_the_table_of_the_readme_is_of_the_record() -> None:
+    """Its rows are some of the record's, in the record's order."""
+    found = re.search(r"\[start:results\] -->\n(\|.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL)
+    grid = summary(Pivot(load_results(ROOT / "docs" / "results" / "comparison.json")))
+    assert found is not None and grid is not None
+    lines, whole = found[1].splitlines(), markdown_table(grid).splitlines()
+    assert lines[:2] == whole[:2] and len(lines) > 4 and lines == [line for line in whole if line in lines]
+
+
+def test_no_figure_is_typed_into_the_template() -> None:
+    """Every decimal of the page comes from a record: the template has integers and settings only."""
+    text = (ROOT / "docs" / "results" / "page.md").read_text()
+    prose = re.sub(r"\{\{.*?\}\}|`[^`]*`|\]\([^)]*\)", "", text)
+    assert not re.findall(r"(?<![\w.])\d*\.\d+", prose)
