@@ -126,4 +126,4 @@ class GaussianScene:
 
     @classmethod
     def _tensor_names(cls) -> list[str]:
-        return [f.name for f in fields(cls) if f.name not in ("volume_scale", "name", "surroundings")]
+        return [f.name for f in fields(cls) if f.name not in ("volume_scale", "name", "surroundings", "law")]
