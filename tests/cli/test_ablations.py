@@ -96,9 +96,10 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path) ->
     assert all(b > 1000 * max(a, 1e-6) for a, b in zip(conserved, free, strict=True)), (conserved, free)
 
 
-def test_no_momentum_computes_no_such_loss(toy: Path) -> None:
+@pytest.mark.parametrize("model", ["gausim", "gausim_paper"])
+def test_no_momentum_computes_no_such_loss(toy: Path, model: str) -> None:
     for ablation, present in (("none", True), ("no_momentum", False)):
-        module, samples = fresh(toy, ablation, "gausim_paper")
+        module, samples = fresh(toy, ablation, model)
         stats = train(module, samples, 2)
         step = random_step(module)
         assert step.momentum.requires_grad == present and (float(step.momentum.detach()) > 1e-6) == present
