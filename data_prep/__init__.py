@@ -1,1 +1,1 @@
-"""Scripts that make or pack data sets; they use gausim, gausim never uses them."""
+"""Makes data sets. A file that cannot be used raises a ``DataError`` with file, field and remedy, whoever reads it."""

@@ -15,7 +15,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from data_prep.capture.films.film import Film, pictures, probe, upright
@@ -33,7 +32,7 @@ from gausim.io.files import write_json
 REVISION = 1
 # PNG's effort: 1 is three times as fast as the default and 10 % larger.
 COMPRESSION = 1
-THUMBNAIL = 64
+THUMBNAIL = 160
 
 LAYOUT = """FILMS is a folder with one folder per sequence, each with one film per camera, named alike in all sequences;
 or a folder with the films of a single sequence. Cameras become cam_0, cam_1 ... in the natural order of their names."""
@@ -113,7 +112,7 @@ def _one_take(take: Take, folder: Path, options: IngestOptions, tick: Tick) -> d
             film, alignment.frames[camera], folder / camera, options.max_side,
             lambda done, i=i: tick(take.source, i * count + done, len(films) * count),  # type: ignore[misc]
         )  # fmt: skip
-    write_sheet(folder / "sync.png", thumbnails, found)
+    write_sheet(folder / "sync.png", thumbnails)
     write_json(marker, found)
     return found
 
@@ -152,24 +151,20 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
 
 
 def _warnings(films: Mapping[str, Film]) -> list[str]:
-    notes = [
-        f"{name}: {film.hdr} footage; its 8-bit frames look flat. Record in standard range."
-        for name, film in films.items()
-        if film.hdr
-    ]
-    notes += [
-        f"{name}: begins between key frames; its first {film.before_key} frames are left out"
-        for name, film in films.items()
-        if film.before_key
-    ]
-    sizes = {film.size for film in films.values()}
-    return notes if len(sizes) == 1 else [*notes, f"cameras have different sizes: {sorted(sizes)}"]
+    notes = []
+    for name, film in films.items():
+        if film.hdr:
+            notes.append(f"{name}: {film.hdr} footage; its 8-bit frames look flat. Record in standard range.")
+        if film.before_key:
+            notes.append(f"{name}: begins between key frames; its first {film.before_key} frames are left out")
+    sizes = sorted({film.size for film in films.values()})
+    return notes if len(sizes) == 1 else [*notes, f"cameras have different sizes: {sizes}"]
 
 
 def _write_camera(
     film: Film, indices: np.ndarray, folder: Path, max_side: int | None, done: Callable[[int], None]
 ) -> list[np.ndarray]:
-    """Writes the frames of one camera that are not there yet; returns a small grey picture of each."""
+    """Writes the frames of one camera that are not there yet; returns a small picture of each."""
     small: dict[int, np.ndarray] = {}
     for index, frame in pictures(film):
         places = np.flatnonzero(indices == index)
@@ -180,7 +175,7 @@ def _write_camera(
             path = folder / f"{place:04d}.png"
             if not path.is_file():
                 write_picture(path, pixels, COMPRESSION)
-            small[place] = reduced(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), THUMBNAIL)
+            small[place] = reduced(pixels, THUMBNAIL)
         done(len(small))
         if len(small) == len(indices):
             break

@@ -35,14 +35,9 @@ _NAMED = 6
 
 
 def find_poses(
-    out: Path,
-    sources: Sources,
-    *,
-    mapping: MappingOptions,
-    world: WorldOptions | None = None,
-    overwrite: bool = False,
+    out: Path, sources: Sources, *, mapping: MappingOptions, world: WorldOptions | None = None, force: bool = False,
     tick: Tick = silent,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Runs the stage.
 
     Raises:
@@ -51,12 +46,11 @@ def find_poses(
     """
     world = world or WorldOptions()
     material = Material.of(sources)
-    settings: dict[str, Any] = {"source": sources.kind, "fps": material.fps}
-    settings["world"] = asdict(world)
+    settings: dict[str, Any] = {"source": sources.kind, "fps": material.fps, "world": asdict(world)}
     if sources.kind == "mapping":
         settings["mapping"] = {k: v for k, v in asdict(mapping).items() if k != "threads"}
     stage = Stage("poses", REVISION, material.inputs, settings, PACKAGES)
-    return run_stage(stage, out, lambda work: _make(work, material, mapping, world, tick), overwrite=overwrite)
+    return run_stage(stage, out, lambda work: _make(work, material, mapping, world, tick), force=force)
 
 
 def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldOptions, tick: Tick) -> dict[str, Any]:
@@ -131,12 +125,8 @@ def _map(
     folder, features, matches, others = map_photos(photos, cameras, work, options, tick)
     model = read_colmap(folder)
     found = from_model(model, {photo.name: photo for photo in photos})
-    results = {
-        "images": len(photos),
-        "registered": len(found),
-        "failed": failures(photos, found, features, matches),
-        "other_models": others,
-    }
+    failed = failures(photos, found, features, matches)
+    results = {"images": len(photos), "registered": len(found), "failed": failed, "other_models": others}
     return found, model.points, results
 
 
@@ -159,7 +149,7 @@ def main(argv: list[str] | None = None) -> int:
     def run(arguments: argparse.Namespace, tick: Tick) -> str:
         manifest = find_poses(
             arguments.out, chosen(Sources, arguments), mapping=chosen(MappingOptions, arguments),
-            world=chosen(WorldOptions, arguments), overwrite=arguments.overwrite, tick=tick,
+            world=chosen(WorldOptions, arguments), force=arguments.force, tick=tick,
         )  # fmt: skip
         return _summary(arguments.out, manifest)
 

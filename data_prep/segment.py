@@ -40,16 +40,9 @@ STEADY = 0.8
 
 
 def segment(
-    source: Path,
-    out: Path,
-    backend: Backend,
-    cleanup: Cleanup,
-    *,
-    kind: str = "auto",
-    every: int = 1,
-    overwrite: bool = False,
-    tick: Tick = silent,
-) -> dict[str, Any]:
+    source: Path, out: Path, backend: Backend, cleanup: Cleanup, *, kind: str = "auto", every: int = 1,
+    force: bool = False, tick: Tick = silent,
+) -> dict[str, Any]:  # fmt: skip
     """Writes the pictures of ``source`` with their masks as alpha.
 
     Raises:
@@ -65,11 +58,8 @@ def segment(
     carried = {} if film or every > 1 else _beside(source)
     inputs = {source.name: source} if film else {**pictures, **carried}
     inputs |= {f"backend/{name}": path for name, path in backend.inputs.items()}
-    settings = {
-        "backend": backend.name, **backend.settings, "cleanup": asdict(cleanup), "kind": kind, "every": every,
-    }  # fmt: skip
+    settings = {"backend": backend.name, **backend.settings, "cleanup": asdict(cleanup), "kind": kind, "every": every}
     packages = ("av", "numpy", "opencv-python-headless", *backend.packages)
-    stage = Stage("segment", REVISION, inputs, settings, packages)
 
     def make(work: Path) -> dict[str, Any]:
         found = clips
@@ -83,7 +73,7 @@ def segment(
             shutil.rmtree(work / folder, ignore_errors=True)
         return {"backend": backend.name, "clips": results}
 
-    return run_stage(stage, out, make, overwrite=overwrite)
+    return run_stage(Stage("segment", REVISION, inputs, settings, packages), out, make, force=force)
 
 
 class _Run:
@@ -113,8 +103,13 @@ class _Run:
             path = self._raw(clip, i)
             if not path.is_file():
                 mask_of = mask_of or self._backend.open(clip)
-                mask = _checked(mask_of(i), clip, i, self._backend.name)
-                write_picture(path, np.round(mask * 255).astype(np.uint8))
+                mask, expected = mask_of(i), clip.rgb(i).shape[:2]
+                if mask.shape != expected or not np.isfinite(mask).all():
+                    raise DataError(
+                        f"{clip.file(i)}: backend '{self._backend.name}' gave a mask of shape {mask.shape} or of no "
+                        f"numbers, expected finite ones of {expected}."
+                    )
+                write_picture(path, np.round(np.clip(mask, 0, 1) * 255).astype(np.uint8))
             self._tick(clip.name, i + 1, len(clip))
 
     def _finish(self, clip: Clip) -> dict[str, Any]:
@@ -137,23 +132,12 @@ class _Run:
             inside = alpha > 127
             coverage.append(float(inside.mean()))
             border.append(float(np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]]).mean()))
-            overlaps.append(1.0 if before is None or before.shape != alpha.shape else overlap(before, alpha))
+            overlaps.append(overlap(before, alpha) if clip.moving and before is not None else 1.0)
             before = alpha
         return _figures(clip, coverage, overlaps, border)
 
     def _raw(self, clip: Clip, index: int) -> Path:
         return self._work / RAW / clip.flat / f"{index:05d}.png"
-
-
-def _checked(mask: np.ndarray, clip: Clip, index: int, backend: str) -> np.ndarray:
-
-    expected = clip.rgb(index).shape[:2]
-    if mask.shape != expected or not np.isfinite(mask).all():
-        raise DataError(
-            f"{clip.file(index)}: backend '{backend}' gave a mask of shape {mask.shape}"
-            f"{'' if np.isfinite(mask).all() else ' with values that are no numbers'}, expected {expected}."
-        )
-    return np.clip(mask, 0, 1)
 
 
 def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: list[float]) -> dict[str, Any]:
@@ -164,16 +148,13 @@ def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: l
             "--backend or its options, or --components 0 if the object is in many small parts."
         )
     names = [path.name for path in clip.paths]
-    steady_by = {"mean": sum(overlaps) / len(overlaps), "least": min(overlaps)}
     return {
-        "pictures": len(clip),
-        "film": clip.moving,
+        "pictures": len(clip), "film": clip.moving, "at_border": sum(border) / len(border),
         "coverage": {"mean": sum(coverage) / len(coverage), "least": min(coverage), "most": max(coverage)},
-        "overlap_with_frame_before": steady_by if clip.moving else None,
-        "at_border": sum(border) / len(border),
+        "overlap_with_frame_before": {"mean": sum(overlaps) / len(overlaps), "least": min(overlaps)},
         "empty": [name for name, part in zip(names, coverage, strict=True) if part == 0],
-        "look_at": [name for name, part in zip(names, overlaps, strict=True) if clip.moving and part < STEADY],
-    }
+        "look_at": [name for name, part in zip(names, overlaps, strict=True) if part < STEADY],
+    }  # fmt: skip
 
 
 def _rate(source: Path) -> float:
@@ -227,7 +208,7 @@ def main(argv: list[str] | None = None) -> int:
         cleanup = replace(UNTOUCHED if arguments.backend == "alpha" else Cleanup(), **given(Cleanup, arguments))
         manifest = segment(
             arguments.pictures, arguments.out, backend, cleanup,
-            kind=arguments.kind, every=arguments.every, overwrite=arguments.overwrite, tick=tick,
+            kind=arguments.kind, every=arguments.every, force=arguments.force, tick=tick,
         )  # fmt: skip
         return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"
 
@@ -238,17 +219,12 @@ def summary(results: Mapping[str, Any]) -> str:
     """A line about every clip, for people."""
     lines = []
     for name, found in results["clips"].items():
-        over = found["overlap_with_frame_before"]
+        part, over = found["coverage"], found["overlap_with_frame_before"]
         lines.append(
-            f"  {name or '.'}: {found['pictures']} pictures, foreground {100 * found['coverage']['mean']:.1f} % "
-            f"({100 * found['coverage']['least']:.1f} to {100 * found['coverage']['most']:.1f})"
-            + (f", overlap with the frame before {over['mean']:.3f} (least {over['least']:.3f})" if over else "")
-            + _some("EMPTY", found["empty"])
-            + _some("look at", found["look_at"])
+            f"  {name or '.'}: {found['pictures']} pictures, foreground {100 * part['mean']:.1f} % "
+            f"({100 * part['least']:.1f} to {100 * part['most']:.1f}), overlap with the frame before at least "
+            f"{over['least']:.3f}"
         )
+        for what, key in (("EMPTY", "empty"), ("look at", "look_at")):
+            lines += [f"    {what}: {', '.join(found[key][:6])}"] if found[key] else []
     return "\n".join([*lines, f"Look at {OVERLAYS}/ before you go on."])
-
-
-def _some(what: str, names: list[str]) -> str:
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return f", {what}: {', '.join(names[:4])}{more}" if names else ""

@@ -6,26 +6,19 @@ Of a file only triangles and polygons are read.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data_prep.common.spread import farthest
-from gausim.core import DataError
-
-if TYPE_CHECKING:
-    from plyfile import PlyElement
+from gausim.core import ConfigError, DataError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FACE_FIELDS = ("vertex_indices", "vertex_index")
-# Larger than any index of a file that fits into memory, and small enough for every integer type used here.
-LARGEST_INDEX = 1 << 40
 # The largest extent of every object [scene units]; forces and lights are made for it.
 SIZE = 2.0
 # Longest edge, as a fraction of the diagonal: the surface bends and carries its paint at its vertices only.
@@ -48,98 +41,25 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Reads an OBJ or PLY file; polygons become fans of triangles (right for convex ones).
-
-    Raises:
-        DataError: the file is missing, of another format, cut off, has no faces, faces with indices that are not there,
-            or coordinates that are no finite numbers.
-    """
-    if not path.is_file():
-        raise DataError(f"{path}: no such file. Expected a mesh in OBJ or PLY format.")
-    readers = {".obj": _read_obj, ".ply": _read_ply}
-    if path.suffix.lower() not in readers:
-        raise DataError(f"{path}: expected a file that ends in .obj or .ply. Convert the mesh first.")
-    vertices, triangles = readers[path.suffix.lower()](path)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
-    if len(bad):
-        raise DataError(f"{path}: vertex {bad[0]} has a coordinate that is no finite number. Export the mesh again.")
-    if not len(triangles):
-        raise DataError(f"{path}: has {len(vertices)} vertices and no faces. Expected a surface.")
-    outside = np.flatnonzero(((triangles < 0) | (triangles >= len(vertices))).any(1))
-    if len(outside):
-        raise DataError(
-            f"{path}: a face uses vertices {triangles[outside[0]].tolist()} (counted from 0), there are "
-            f"{len(vertices)}. Export the mesh again."
-        )
+    """Reads an OBJ or PLY file; polygons become fans of triangles (right for convex ones)."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ConfigError("trimesh reads meshes. Install it: `pip install 'gausim[synth]'`.") from error
+    if not path.is_file() or path.suffix.lower() not in (".obj", ".ply"):
+        raise DataError(f"{path}: no such file in OBJ or PLY format. Convert the mesh first.")
+    try:
+        # As they stand in the file, without materials, which would split vertices.
+        found: Any = trimesh.load(path, process=False, maintain_order=True, skip_materials=True, force="mesh")
+        vertices, triangles = np.array(found.vertices, np.float64), np.array(found.faces, np.int64)
+    except Exception as error:  # its readers raise many kinds of exceptions on damaged files
+        raise DataError(f"{path}: cannot be read as a mesh ({error!s:.120}). Export it again, as triangles.") from error
+    triangles = np.where(triangles < 0, triangles + len(vertices), triangles)
+    if not len(triangles) or not np.isfinite(vertices).all():
+        raise DataError(f"{path}: has {len(vertices)} vertices and {len(triangles)} faces, expected finite ones.")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise DataError(f"{path}: a face uses a vertex that is not there, of {len(vertices)}. Export the mesh again.")
     return Mesh(vertices, triangles)
-
-
-def _read_obj(path: Path) -> tuple[Array, Indices]:
-    text = path.read_bytes().decode("latin-1").replace("\\\r\n", " ").replace("\\\n", " ")
-    vertices: list[list[float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#", 1)[0].split()
-        try:
-            if words[:1] == ["v"]:
-                x, y, z = (float(word) for word in words[1:4])
-                vertices.append([x, y, z])
-            elif words[:1] == ["f"]:
-                triangles += _fan([_obj_index(word, len(vertices)) for word in words[1:]])
-        except ValueError as error:
-            raise DataError(f"{path}: line {number}: '{line[:60]}' is no vertex or face ({error}).") from None
-    return np.array(vertices, np.float64).reshape(-1, 3), np.array(triangles, np.int64).reshape(-1, 3)
-
-
-def _obj_index(word: str, known: int) -> int:
-    """Index from 0 on of ``7``, ``7/1/3`` or ``-1`` (the last vertex so far)."""
-    index = int(word.split("/", 1)[0])
-    if index == 0 or abs(index) > LARGEST_INDEX:
-        raise ValueError("vertices are counted from 1, or backwards from -1")
-    return index - 1 if index > 0 else known + index
-
-
-def _fan(corners: Sequence[int]) -> list[tuple[int, int, int]]:
-    if len(corners) < 3:
-        raise ValueError(f"a face needs at least 3 corners, this has {len(corners)}")
-    return [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
-
-
-def _read_ply(path: Path) -> tuple[Array, Indices]:
-    from gausim.io.ply import positions, read_ply
-
-    vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    for element in read_ply(path):
-        if element.name == "vertex":
-            vertices = positions(path, element)
-        elif element.name == "face":
-            triangles = _faces(path, element)
-    return vertices, triangles
-
-
-def _faces(path: Path, element: PlyElement) -> Indices:
-    from gausim.io.ply import list_properties
-
-    lists = list_properties(element)
-    chosen = next((name for name in FACE_FIELDS if name in lists), None)
-    if chosen is None:
-        raise DataError(f"{path}: faces have lists {lists}, expected '{FACE_FIELDS[0]}'.")
-    column = element[chosen]
-    if all(len(corners) == 3 for corners in column):
-        return _whole(path, np.array(list(column)).reshape(-1, 3))
-    triangles: list[tuple[int, int, int]] = []
-    for i, corners in enumerate(column):
-        try:
-            triangles += _fan(_whole(path, np.asarray(corners)).tolist())
-        except ValueError as error:
-            raise DataError(f"{path}: face {i}: {error}.") from None
-    return np.array(triangles, np.int64).reshape(-1, 3)
-
-
-def _whole(path: Path, indices: np.ndarray) -> Indices:
-    if not ((np.abs(indices.astype(np.float64)) <= LARGEST_INDEX) & (indices == np.trunc(indices))).all():
-        raise DataError(f"{path}: a face uses a vertex that is no whole number up to {LARGEST_INDEX}. Export it again.")
-    return indices.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -158,11 +78,7 @@ class Surface:
 
 
 def make_surface(mesh: Mesh, path: Path, *, up: str, points: int, seed: int) -> Surface:
-    """Brings a mesh to its place, refines it where its edges are long, and paints it.
-
-    Raises:
-        DataError: the mesh has no area, or too many triangles.
-    """
+    """Brings a mesh to its place, refines it where its edges are long, and paints it."""
     placed = _placed(_tidy(mesh, path), path, up)
     longest = LONGEST_EDGE * float(np.linalg.norm(np.ptp(placed.vertices, axis=0)))
     fine = refine(placed, longest, path)
@@ -204,11 +120,7 @@ def _placed(mesh: Mesh, path: Path, up: str) -> Mesh:
 
 
 def refine(mesh: Mesh, longest: float, path: Path = Path("mesh")) -> Mesh:
-    """Halves edges until none is longer than ``longest``; neighbours stay joined.
-
-    Raises:
-        DataError: it would take more than two million triangles.
-    """
+    """Halves edges until none is longer than ``longest``; neighbours stay joined."""
     vertices, triangles = mesh.vertices, mesh.triangles
     while True:
         corners = np.stack([triangles, np.roll(triangles, -1, 1)], -1)  # (T, 3, 2): edge i joins corners i and i + 1

@@ -53,11 +53,7 @@ class Photo:
         return replace(self, width=width, height=height, upright=True)
 
     def read(self) -> np.ndarray:
-        """(H, W, 4) uint8 RGBA with straight alpha.
-
-        Raises:
-            DataError: it cannot be decoded, or is of another size than its header says.
-        """
+        """(H, W, 4) uint8 RGBA with straight alpha."""
         pixels = read_picture(self.path)
         pixels = exif_turned(pixels, self.orientation) if self.upright else pixels
         if pixels.shape[:2] != (self.height, self.width):
@@ -69,11 +65,7 @@ class Photo:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files in a folder, in natural order (2 before 10).
-
-    Raises:
-        DataError: there is no such folder, or no image in it.
-    """
+    """The image files in a folder, in natural order (2 before 10)."""
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder. Expected one with photos.")
     found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
@@ -89,11 +81,7 @@ def unread_in(folder: Path) -> str:
 
 
 def open_photo(path: Path, name: str) -> Photo:
-    """Size and focal length of a photo, without decoding it.
-
-    Raises:
-        DataError: it is missing or no image.
-    """
+    """Size and focal length of a photo, without decoding it."""
     header = read_header(path)
     if header is None:
         what = "cannot be read as an image" if path.is_file() else "no such file"
@@ -105,11 +93,7 @@ def open_photo(path: Path, name: str) -> Photo:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Decodes a picture to (H, W, 4) uint8 RGBA with straight alpha, as stored; opaque where the file has no alpha.
-
-    Raises:
-        DataError: it is missing, cannot be decoded, or its values are no integers of 8 or 16 bit.
-    """
+    """Decodes a picture to (H, W, 4) uint8 RGBA with straight alpha, as stored; opaque where the file has no alpha."""
     pixels = _stored(path)
     if pixels.dtype == np.uint16:
         pixels = np.round(pixels / 257.0).astype(np.uint8)
@@ -145,9 +129,6 @@ def read_mask(path: Path, size: tuple[int, int], of: str) -> np.ndarray:
         path: the file.
         size: width and height that it must have [pixels].
         of: what it is the mask of, for messages.
-
-    Raises:
-        DataError: it is missing, no picture, of another size, or its values are those of no mask.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such file, expected the mask of {of}. Restore it.")
@@ -173,11 +154,7 @@ def read_mask(path: Path, size: tuple[int, int], of: str) -> np.ndarray:
 
 
 def find_mask(folder: Path, name: Path) -> Path:
-    """The mask of a picture by its name in a folder of masks: with the ending .png, its own, or both.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The mask of a picture by its name in a folder of masks: with the ending .png, its own, or both."""
     place = folder / name
     for candidate in (place.with_suffix(".png"), place, place.with_name(f"{place.name}.png")):
         if candidate.is_file():
@@ -186,11 +163,7 @@ def find_mask(folder: Path, name: Path) -> Path:
 
 
 def write_picture(path: Path, pixels: np.ndarray, effort: int = 1) -> None:
-    """Writes (H, W), (H, W, 3) RGB or (H, W, 4) RGBA uint8 as PNG (or JPEG by its name), whole or not at all.
-
-    Raises:
-        DataError: it cannot be encoded.
-    """
+    """Writes (H, W), (H, W, 3) RGB or (H, W, 4) RGBA uint8 as PNG (or JPEG by its name), whole or not at all."""
     settings = [cv2.IMWRITE_PNG_COMPRESSION, effort] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 90]
     code = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
     good, data = cv2.imencode(path.suffix, pixels if code is None else cv2.cvtColor(pixels, code), settings)

@@ -1,4 +1,4 @@
-"""Fields of the public sets' files, checked: records, lenses, poses, names of files inside a folder."""
+"""Fields of the public sets' files, checked: a :class:`DataError` names file and field of what is not as expected."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.common.photos import open_photo
 from gausim.core.errors import DataError
 from gausim.io.plain_json import checked, read_any_json
 
@@ -25,20 +26,12 @@ REMEDY = "Take the file that the set's authors publish."
 
 
 def read_record(path: Path, kind: Any) -> Any:
-    """The content of a JSON file, converted to a type.
-
-    Raises:
-        DataError: it is missing, no JSON, or a field is missing or of another type.
-    """
+    """The content of a JSON file, converted to a type."""
     return checked(read_any_json(path), kind, str(path), REMEDY)
 
 
 def rate_of(times: list[float], where: str) -> float:
-    """Frames per second by the times of the frames [s].
-
-    Raises:
-        DataError: the times do not rise by equal steps.
-    """
+    """Frames per second by the times of the frames [s]."""
     steps = np.diff(numbers(times, (-1,), where))
     if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > _UNEVEN * steps.mean():
         raise DataError(f"{where}: expected times [s] that rise by equal steps, got {times[:4]}. State --fps.")
@@ -46,11 +39,7 @@ def rate_of(times: list[float], where: str) -> float:
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """A float64 array of this shape from nested lists or an array; −1 stands for any length but 0.
-
-    Raises:
-        DataError: it has another shape, or a number is not finite.
-    """
+    """A float64 array of this shape from nested lists or an array; −1 stands for any length but 0."""
     wrong = f"{where}: expected finite numbers of shape ({', '.join('?' if n < 0 else str(n) for n in shape)})"
     try:
         array = np.asarray(value)
@@ -65,11 +54,7 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 
 
 def lens(value: Any, where: str) -> np.ndarray:
-    """(3, 3) K [pixels] of a pinhole camera.
-
-    Raises:
-        DataError: it is none.
-    """
+    """(3, 3) K [pixels] of a pinhole camera."""
     k = numbers(value, (3, 3), where)
     flat = abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) < 1e-6
     if min(k[0, 0], k[1, 1]) <= 0 or not flat or abs(k[0, 1]) > _SKEW * k[0, 0]:
@@ -88,9 +73,6 @@ def viewmat(value: Any, where: str, *, opengl: bool = False, inverse: bool = Fal
         where: file and field.
         opengl: the camera's axes are x right, y up, z back.
         inverse: the matrix is camera to world.
-
-    Raises:
-        DataError: it is no rotation with a translation.
     """
     rows = 3 if isinstance(value, list | np.ndarray) and len(value) == 3 else 4
     matrix = np.eye(4)
@@ -109,11 +91,7 @@ def viewmat(value: Any, where: str, *, opengl: bool = False, inverse: bool = Fal
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """The path of a file by its name within a folder.
-
-    Raises:
-        DataError: the name is none, or leads out of the folder.
-    """
+    """The path of a file by its name within a folder."""
     parts = Path(name).parts if name.isprintable() and 0 < len(name) <= 1000 else ()
     if not parts or Path(name).is_absolute() or ".." in parts or any(len(part.encode()) > 255 for part in parts):
         raise DataError(f"{where}: expected a file name inside {folder}, got {name!r:.80}. {REMEDY}")
@@ -121,23 +99,21 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 
 def check_name(name: str, where: str) -> str:
-    """A camera's or a sequence's name, which becomes a folder.
-
-    Raises:
-        DataError: it is no plain name.
-    """
+    """A camera's or a sequence's name, which becomes a folder."""
     if not _NAME.fullmatch(name):
         raise DataError(f"{where}: expected a name of letters, digits, '_', '.' and '-', got {name!r:.80}. {REMEDY}")
     return name
 
 
 def numbered(paths: dict[int, Path], where: str) -> tuple[Path, ...]:
-    """Frames by number, which must run from 0 without a gap.
-
-    Raises:
-        DataError: there are none, or one is missing.
-    """
+    """Frames by number, which must run from 0 without a gap."""
     gap = next((number for number in range(len(paths)) if number not in paths), None)
     if not paths or gap is not None:
         raise DataError(f"{where}: frame {gap or 0} is missing; expected frames from 0 on without a gap. Restore it.")
     return tuple(paths[number] for number in range(len(paths)))
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Width and height of a picture [pixels]."""
+    photo = open_photo(path, path.name)
+    return photo.width, photo.height

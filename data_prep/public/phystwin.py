@@ -21,8 +21,8 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist
 
 from data_prep.common.command import option
-from data_prep.public.cutting import masked, size_of
-from data_prep.public.fields import REMEDY, lens, numbers, read_record, viewmat
+from data_prep.common.photos import read_mask, read_picture
+from data_prep.public.fields import REMEDY, lens, numbers, read_record, size_of, viewmat
 from data_prep.public.pickles import read_pickle
 from data_prep.public.scene import GRAVITY, ImportOptions, Motion, Picture, PublicObject, View
 from gausim.core.errors import DataError
@@ -61,11 +61,7 @@ class _Split(Struct):
 
 
 def read(root: Path, options: Options) -> PublicObject:
-    """One case.
-
-    Raises:
-        DataError: a file is missing or malformed, or files do not go together.
-    """
+    """One case."""
     meta = read_record(root / META, _Meta)
     views, count = _views(root, meta), meta.frame_num
     infos = [_mask_info(root / "mask" / f"mask_info_{i}.json") for i in range(len(views))]
@@ -135,8 +131,18 @@ def _pictures(root: Path, camera: int, number: str, size: tuple[int, int], count
             raise DataError(f"{path}: no such frame, though {META}: field 'frame_num' is {count}. Restore the frames.")
         mask = root / "mask" / str(camera) / number / f"{t}.png"
         ignored = (human / f"{t}.png",) if human.is_dir() else ()
-        pictures.append(Picture((path, mask, *ignored), partial(masked, path, mask, size, *ignored)))
+        pictures.append(Picture((path, mask, *ignored), partial(_masked, size, path, mask, *ignored)))
     return tuple(pictures)
+
+
+def _masked(size: tuple[int, int], path: Path, mask: Path, *ignored: Path) -> np.ndarray:
+    """Colour and the object's mask, without the human's pixels."""
+    pixels, alpha = read_picture(path), read_mask(mask, size, path.name)
+    for other in ignored:
+        alpha = np.where(read_mask(other, size, path.name) > 0, 0, alpha)
+    if pixels.shape[:2] == alpha.shape:  # else it is refused later
+        pixels[..., 3] = alpha
+    return pixels
 
 
 def _final(path: Path, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

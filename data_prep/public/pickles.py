@@ -20,11 +20,7 @@ _MOST_COPIES = 4
 
 
 def read_pickle(path: Path) -> Any:
-    """The numpy arrays of numbers or truth values in a pickle, in lists, tuples and dicts.
-
-    Raises:
-        DataError: the file is missing or damaged, or holds anything else; nothing in it was executed.
-    """
+    """The numpy arrays of numbers or truth values in a pickle, in lists, tuples and dicts."""
     try:
         with path.open("rb") as file:
             data = _Unpickler(file, encoding="latin1").load()

@@ -62,11 +62,7 @@ class Meta:
 
 
 def read_meta(path: Path) -> Meta:
-    """Reads ``meta.json``.
-
-    Raises:
-        DataError: it is missing or malformed.
-    """
+    """Reads ``meta.json``."""
     data, twins = read_record(path, dict), dict[str, str]()
     lists = checked(data, Lists, str(path), REMEDY)
     train, test, *invalid = (_names(path, row or []) for row in
@@ -92,11 +88,7 @@ def _names(path: Path, values: list[str | int] | tuple[str | int, ...]) -> tuple
 
 
 def read(root: Path, options: Options) -> PublicObject:
-    """One object.
-
-    Raises:
-        DataError: the model or ``meta.json`` is missing or malformed, an image is missing, or no sequence is usable.
-    """
+    """One object."""
     model, meta = read_colmap(find_colmap(root)), read_meta(root / "meta.json")
     images = {Path(image.name).stem: image for image in model.images}
     used, left_out = _usable(root / "video_images", set(images), meta)

@@ -6,26 +6,19 @@ floor at y = 0.3; frames 0 to 19 are trained on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from msgspec import Struct
 
-from data_prep.common.photos import list_images
-from data_prep.public.cutting import size_of, with_alpha
-from data_prep.public.fields import check_name, lens, numbered, rate_of, read_record, viewmat
+from data_prep.common.photos import list_images, read_picture
+from data_prep.public.fields import check_name, lens, numbered, rate_of, read_record, size_of, viewmat
 from data_prep.public.scene import ImportOptions, Motion, Picture, PublicObject, View, falling
 from gausim.core.errors import DataError
 
-CAMERAS = "camera.json"
+Options, CAMERAS = ImportOptions, "camera.json"
 # Their renderer's world: frames every 0.03 s, a floor at this height, the first 20 of 30 frames seen.
 FPS, FLOOR, SEEN = 1 / 0.03, 0.3, 20
-
-
-@dataclass(frozen=True)
-class Options(ImportOptions):
-    """Facts that the folder does not contain."""
 
 
 class _Camera(Struct):
@@ -34,12 +27,8 @@ class _Camera(Struct):
     c2w: list
 
 
-def read(root: Path, options: Options) -> PublicObject:
-    """One synthetic object.
-
-    Raises:
-        DataError: ``camera.json``, ``frame.json`` or a folder of frames is missing or malformed.
-    """
+def read(root: Path, options: ImportOptions) -> PublicObject:
+    """One synthetic object."""
     path, views, pictures = root / CAMERAS, [], {}
     for i, entry in enumerate(read_record(path, list[_Camera])):
         where = f"{path}: [{i}]: field"
@@ -48,7 +37,7 @@ def read(root: Path, options: Options) -> PublicObject:
         size = size_of(frames[0])
         pose = viewmat(entry.c2w, f"{where} 'c2w'", opengl=True, inverse=True)
         views.append(View(name, size, lens(entry.K, f"{where} 'K'"), pose))
-        pictures[name] = tuple(Picture((p,), partial(with_alpha, p, size)) for p in frames)
+        pictures[name] = tuple(Picture((p,), partial(read_picture, p)) for p in frames)
     if not views or len(pictures) < len(views):
         raise DataError(f"{path}: expected cameras with names of their own, got {[view.name for view in views]}.")
     count, times = min(len(row) for row in pictures.values()), root / "frame.json"

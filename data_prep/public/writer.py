@@ -28,11 +28,7 @@ class ObjectWriter:
         self._bare: set[str] = set()
 
     def write(self, out: Path) -> dict[str, Any]:
-        """Writes everything that is missing and returns what is worth telling; ``out`` is the result's later name.
-
-        Raises:
-            DataError: a picture is unusable, or the object would have faults.
-        """
+        """Writes everything that is missing and returns what is worth telling; ``out`` is the result's later name."""
         found = self._found
         for motion in found.motions:
             self._motion(motion)
@@ -92,6 +88,7 @@ class ObjectWriter:
                     f"{view.size[0]}x{view.size[1]}. Use the pictures that belong to the cameras."
                 )
             opaque = pixels[..., 3].min() == 255
+            pixels[pixels[..., 3] == 0] = 0  # keeps files small
             write_picture(target, resized(pixels[..., :3] if opaque else pixels, small.size))
         header = read_header(target)
         if header is None or header.mode != "RGBA":

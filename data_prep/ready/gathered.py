@@ -39,11 +39,7 @@ class Gathered:
 
 
 def gather(folders: Sequence[Path]) -> Gathered:
-    """Looks for posed pictures; what a later folder has replaces what an earlier one has by the same name.
-
-    Raises:
-        DataError: a folder holds nothing posed, a ``transforms.json`` is malformed, or a picture has no alpha.
-    """
+    """Looks for posed pictures; what a later folder has replaces what an earlier one has by the same name."""
     stills: PosedImages | None = None
     sequences: dict[str, PosedImages] = {}
     facts: dict[str, Any] = {}
@@ -102,11 +98,7 @@ def _inside(transforms: Path, picture: Path) -> str:
 
 
 def common_views(sequences: Mapping[str, PosedImages]) -> tuple[str, ...]:
-    """The cameras of all sequences, in natural order.
-
-    Raises:
-        DataError: two sequences have different ones.
-    """
+    """The cameras of all sequences, in natural order."""
     views = {name: tuple(sorted({f.camera for f in s.frames}, key=natural)) for name, s in sequences.items()}
     first = next(iter(views))
     for name, found in views.items():
@@ -119,11 +111,7 @@ def common_views(sequences: Mapping[str, PosedImages]) -> tuple[str, ...]:
 
 
 def common_rate(sequences: Mapping[str, PosedImages]) -> float | None:
-    """Frames per second that the sequences state; None where none does.
-
-    Raises:
-        DataError: two state different rates.
-    """
+    """Frames per second that the sequences state; None where none does."""
     rates = {name: posed.fps for name, posed in sequences.items() if posed.fps is not None}
     if len(set(rates.values())) > 1:
         raise DataError(f"sequences have different rates [frames per second]: {rates}. Ingest them with one --fps.")

@@ -22,9 +22,6 @@ def read_pins(path: Path, count: int) -> np.ndarray:
     """(count,) bool of ``pin_mask.json``: a list of kernel numbers, or of one truth value per kernel.
 
     The list may stand alone or as the only list of an object.
-
-    Raises:
-        DataError: it is anything else, or a number is no kernel's.
     """
     data = read_any_json(path)
     if isinstance(data, dict):

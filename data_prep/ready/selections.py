@@ -81,11 +81,7 @@ def parse_selection(text: str) -> tuple[Selection, list[Path]]:
 
 
 def read_points(path: Path) -> np.ndarray:
-    """(P, 3) float32 points of an ``npz`` (array ``points``), a ``ply`` or a text of three numbers per line.
-
-    Raises:
-        DataError: the file is missing, malformed, empty or too large, or a number is not finite.
-    """
+    """(P, 3) float32 points of an ``npz`` (array ``points``), a ``ply`` or a text of three numbers per line."""
     if path.suffix.lower() == ".ply":
         found = (positions(path, element) for element in read_ply(path) if element.name == "vertex")
         points = next(found, np.zeros(0))

@@ -48,9 +48,6 @@ def straighten(camera: ColmapCamera, where: Path) -> Straightened:
 
     COLMAP's undistortion chooses focal length and size so that no pixel is blank; that image is magnified until it
     covers the photo's size, and cropped to it around its middle. So all photos of one size stay of one size.
-
-    Raises:
-        DataError: the lens of the photo ``where`` sees no rectangle (it folds over, or its field of view is too wide).
     """
     import pycolmap
 

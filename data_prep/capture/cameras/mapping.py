@@ -57,8 +57,7 @@ class MappingOptions(Options):
     overlap: int = option(10, "next photos in sequential matching (%(default)s)", least=1, metavar="N")
     features: int = option(4096, "at most so many per photo (%(default)s)", least=1, metavar="N")
     feature_size: int = option(1600, "longer side they are found at (%(default)s)", least=64, metavar="PIXELS")
-    # Features that survive oblique views (affine, over several sizes), weaker ones too, and a second search for matches
-    # along the lines that the first ones give.
+    # Affine features over several sizes, weaker ones too, and a second search for matches.
     thorough: bool = option(False, "for few photos from places far apart: finds more, takes far longer")
     threads: int = option(1, "more: faster, repeatable up to rounding (%(default)s)", least=1, metavar="N")
 
@@ -77,9 +76,6 @@ def map_photos(
     Returns:
         Folder of the COLMAP model with most images, in the photos' names; per photo the number of its features, and
         the inliers of all its verified pairs; numbers of images of the models that could not be joined with that one.
-
-    Raises:
-        DataError: no two photos fit together.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     if len(photos) < _SMALLEST_MODEL:

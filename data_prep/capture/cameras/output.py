@@ -28,11 +28,7 @@ class PosedWriter:
             ColmapCamera(model, width, height, np.array(params)), where))  # fmt: skip
 
     def stills(self, out: Path, posed: Sequence[Posed]) -> None:
-        """Writes ``images/*.png`` and ``transforms.json``; images that are there already stay.
-
-        Raises:
-            DataError: the photos differ in size, two would get one name, or a lens cannot be straightened.
-        """
+        """Writes ``images/*.png`` and ``transforms.json``; images that are there already stay."""
         check_one_size([shot.photo for shot in posed])
         files: dict[str, str] = {}
         for shot in posed:
@@ -48,11 +44,7 @@ class PosedWriter:
         self._transforms(out / "transforms.json", posed, entries, None)
 
     def sequence(self, out: Path, folders: Mapping[str, Path], cameras: Mapping[str, Posed], fps: float | None) -> int:
-        """Writes the frames of a sequence with their fixed cameras, and returns their number.
-
-        Raises:
-            DataError: cameras differ in size or in number of frames, or a frame is of another size.
-        """
+        """Writes the frames of a sequence with their fixed cameras, and returns their number."""
         check_one_size([shot.photo for shot in cameras.values()])
         frames = {name: list_images(folders[name]) for name in cameras}
         counts = {name: len(paths) for name, paths in frames.items()}
@@ -121,9 +113,6 @@ def sequence_cameras(
 
     A camera ``cam_0`` of ``seq_003`` is the image ``seq_003/cam_0`` (with any ending), one in a folder of that name,
     or, for cameras that never move, ``cam_0``.
-
-    Raises:
-        DataError: a frame has another shape than its camera was calibrated for.
     """
     found, missing = {}, []
     for name in cameras:

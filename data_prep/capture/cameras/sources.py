@@ -85,11 +85,7 @@ class Material:
 
     @staticmethod
     def of(sources: Sources) -> Material:
-        """Looks what is there.
-
-        Raises:
-            DataError: something that was named is missing or malformed.
-        """
+        """Looks what is there."""
         stills: tuple[Photo, ...] = ()
         posed, inputs = _taken_over(sources)
         if sources.images is not None and posed is None:
@@ -142,9 +138,6 @@ def from_model(model: ColmapModel, images: Path | Mapping[str, Photo]) -> list[P
     Args:
         model: the model.
         images: the folder of the photos, or the photos by the model's names.
-
-    Raises:
-        DataError: a photo is missing or has another shape than the model's.
     """
     photos = images if isinstance(images, Mapping) else {
         image.name: open_photo(images / image.name, image.name) for image in model.images
@@ -164,9 +157,6 @@ def fitted(camera: ColmapCamera, photo: Photo) -> tuple[Photo, ColmapCamera]:
     """The camera for a photo that was made smaller or larger after it was calibrated, and the photo as it saw it.
 
     Pixels are those that are stored, unless the camera was calibrated for the picture as its EXIF data turn it.
-
-    Raises:
-        DataError: the photo has another shape, so it was cropped or turned.
     """
     for seen in (photo, photo.turned()):
         x, y = seen.width / camera.width, seen.height / camera.height
@@ -180,12 +170,7 @@ def fitted(camera: ColmapCamera, photo: Photo) -> tuple[Photo, ColmapCamera]:
 
 
 def read_lens_transforms(path: Path) -> list[Posed]:
-    """The frames of a ``transforms.json`` whose lenses may be distorted (nerfstudio's models), for their photos' size.
-
-    Raises:
-        DataError: the file, a field or a photo is missing or malformed, a pose is no rotation with a translation, or
-            the lens is of a model that cannot be straightened.
-    """
+    """The frames of a ``transforms.json``, whose lenses may be distorted (nerfstudio's models)."""
     from gausim.core import Cameras
     from gausim.io.transforms import image_name, pinhole_of, read_entries, size_field, viewmat_of
 

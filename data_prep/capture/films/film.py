@@ -81,12 +81,7 @@ class Film:
 
 
 def probe(path: Path) -> Film:
-    """Reads a film's facts: all packets, one picture.
-
-    Raises:
-        DataError: the file is missing, empty, no film, cut off or damaged, interlaced, turned by an odd angle, has
-            fewer than two frames or frames without time stamps.
-    """
+    """Reads a film's facts: all packets, one picture."""
     if not path.is_file():
         raise DataError(f"{path}: no such film.")
     if path.stat().st_size == 0:
@@ -113,11 +108,7 @@ def probe(path: Path) -> Film:
 
 
 def pictures(film: Film) -> Iterator[tuple[int, av.VideoFrame]]:
-    """Decodes all frames in presentation order, each with its index.
-
-    Raises:
-        DataError: a frame is damaged.
-    """
+    """Decodes all frames in presentation order, each with its index."""
     index = {int(stamp): i for i, stamp in enumerate(film.pts)}
     done = 0
     try:
@@ -146,11 +137,7 @@ class FilmFrames:
     """Frames of a film of a constant rate, read by their numbers; rising numbers are read in one pass."""
 
     def __init__(self, path: Path) -> None:
-        """Reads the film's facts.
-
-        Raises:
-            DataError: it is unusable, or its rate varies.
-        """
+        """Reads the film's facts."""
         self.facts = probe(path)
         if self.facts.variable:
             shortest, longest = (1000 * interval for interval in self.facts.intervals)
@@ -178,47 +165,29 @@ def sound(film: Film) -> tuple[np.ndarray, float]:
 
     Returns:
         Samples (float32, about −1..1) and when the first is heard [s], on the clock of the pictures.
-
-    Raises:
-        DataError: there is none, it is damaged, or its time stamps leap.
     """
-    from scipy.signal import resample_poly
-
-    blocks: list[tuple[int, np.ndarray]] = []
-    rate = 0
+    blocks: list[np.ndarray] = []
+    first = end = 0.0
     try:
         with av.open(str(film.path)) as container:
-            if not container.streams.audio:
-                raise DataError(f"{film.path}: has no sound.")
-            resampler = av.AudioResampler(format="fltp", layout="mono")
+            resampler = av.AudioResampler(format="fltp", layout="mono", rate=SOUND_RATE)
             for frame in container.decode(audio=0):
-                if frame.pts is None:
-                    raise DataError(f"{film.path}: its sound has no time stamps. Choose another --sync.")
-                rate = frame.sample_rate
-                start = round(frame.pts * frame.time_base * rate)
-                blocks += [(start, part.to_ndarray()[0]) for part in resampler.resample(frame)]
-                if start - blocks[0][0] > SOUND_SECONDS * rate:
+                start = float((frame.pts or 0) * frame.time_base)
+                first, end = (start, start) if not blocks else (first, end)
+                hole = round((start - end) * SOUND_RATE)
+                if not -0.01 * SOUND_RATE <= hole < SOUND_SECONDS * SOUND_RATE:
+                    raise DataError(f"{film.path}: the time stamps of its sound leap. Choose another --sync.")
+                blocks += [np.zeros(max(0, hole), np.float32)]
+                blocks += [part.to_ndarray()[0] for part in resampler.resample(frame)]
+                end = max(end, start) + frame.samples / frame.sample_rate
+                if end - first > SOUND_SECONDS:
                     break
-    except (FFmpegError, OSError, ValueError) as error:
+            blocks += [part.to_ndarray()[0] for part in resampler.resample(None)]
+    except (FFmpegError, OSError, ValueError, IndexError) as error:
         raise DataError(f"{film.path}: its sound cannot be decoded ({error}). Choose another --sync.") from error
-    if not blocks:
-        raise DataError(f"{film.path}: its sound is empty. Choose another --sync.")
-    samples, first = _laid_out(film.path, blocks, rate)
-    ratio = Fraction(SOUND_RATE, rate)
-    return resample_poly(samples, ratio.numerator, ratio.denominator).astype(np.float32), first / rate
-
-
-def _laid_out(path: Path, blocks: list[tuple[int, np.ndarray]], rate: int) -> tuple[np.ndarray, int]:
-    """Blocks of samples at their places; holes are silent."""
-    first = blocks[0][0]
-    end = max(start + len(block) for start, block in blocks)
-    if min(start for start, _ in blocks) < first or end - first > (SOUND_SECONDS + 10) * rate:
-        raise DataError(f"{path}: the time stamps of its sound leap. Choose another --sync.")
-    samples = np.zeros(end - first, np.float32)
-    for start, block in blocks:
-        samples[start - first : start - first + len(block)] = block
-    if not np.isfinite(samples).all():
-        raise DataError(f"{path}: its sound holds values that are no numbers. Choose another --sync.")
+    samples = np.concatenate(blocks) if blocks else np.zeros(0, np.float32)
+    if not len(samples) or not np.isfinite(samples).all():
+        raise DataError(f"{film.path}: its sound is empty or holds no numbers. Choose another --sync.")
     return samples, first
 
 

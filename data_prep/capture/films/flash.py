@@ -35,9 +35,6 @@ def flashes(levels: np.ndarray, times: np.ndarray, *, interval: float) -> list[f
         levels: brightness of N frames in linear light, 0..1.
         times: when each frame's exposure begins [s].
         interval: time between frames [s], which the exposure is taken to last.
-
-    Raises:
-        DataError: there is no step that stands out.
     """
     if len(levels) < 4:
         raise DataError(f"{len(levels)} frames are too few to find a flash.")
@@ -62,9 +59,6 @@ def flash_lag(first: list[float], second: list[float], *, interval: float) -> tu
 
     Returns:
         The difference of starts and the largest disagreement between flashes [s].
-
-    Raises:
-        DataError: their flashes can be matched in several ways.
     """
     within = SAME * interval
     ways = []

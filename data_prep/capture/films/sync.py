@@ -60,9 +60,6 @@ def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float
         films: by camera.
         method: one of ``METHODS``, or ``auto``: sound, else a flash, else what is given.
         given: by camera, offsets that the user states [s]; cameras that are not named have 0.
-
-    Raises:
-        DataError: the method does not apply (which camera, why, and what to do).
     """
     if len(films) == 1:
         zero = dict.fromkeys(films, 0.0)
@@ -79,14 +76,9 @@ def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float
 
 
 def align(
-    films: Mapping[str, Film],
-    offsets: Offsets,
-    *,
-    rate: Fraction | None = None,
-    reference: str | None = None,
-    start: float = 0.0,
-    duration: float | None = None,
-) -> Alignment:
+    films: Mapping[str, Film], offsets: Offsets, *, rate: Fraction | None = None, reference: str | None = None,
+    start: float = 0.0, duration: float | None = None,
+) -> Alignment:  # fmt: skip
     """Nearest frames of all cameras on the times of one.
 
     Args:
@@ -96,14 +88,15 @@ def align(
         reference: whose frames give the times; of the slowest cameras the one with the smallest residuals when None.
         start: time left out at the beginning of the common interval [s].
         duration: how much of it is kept [s]; all when None.
-
-    Raises:
-        DataError: rates are no multiples of the output's, the films have no time in common, a residual is above half a
-            frame, or a camera's measurements disagree by more than that.
     """
     rate = rate or min(film.rate for film in films.values())
     steps = {name: _step(name, film, rate) for name, film in films.items()}
-    _check_agreement(films, offsets, float(rate))
+    for name, film in films.items():
+        if offsets.spread[name] * float(rate) > LIMIT:
+            raise DataError(
+                f"{name} ({film.path.name}): its flashes disagree by {offsets.spread[name] * float(rate):.2f} frames, "
+                f"allowed {LIMIT:g}: frames are missing. Cut the film shorter, or choose another --sync."
+            )
     candidates = [reference] if reference else [name for name in films if steps[name] == min(steps.values())]
     window = _common(films, offsets, rate, start)
     most = None if duration is None else max(1, round(duration * float(rate)))
@@ -112,7 +105,13 @@ def align(
     for name, residual in best.residuals.items():
         worst = int(np.abs(residual).argmax())
         if abs(residual[worst]) > LIMIT + _rounding(films[name], rate):
-            _refuse(films[name], name, worst, float(residual[worst]), best)
+            shortest, longest = (1000 * interval for interval in films[name].intervals)
+            raise DataError(
+                f"{name} ({films[name].path.name}): output frame {worst}: its nearest ({best.frames[name][worst]}) is "
+                f" {residual[worst]:+.2f} frames from its place on the times of {best.reference}, allowed {LIMIT:g}. "
+                f"Check its offset and rate. If the rate varies or frames are missing (they come {shortest:.1f} to "
+                f"{longest:.1f} ms apart), cut the film before the gap (--start, --duration)."
+            )
     return best
 
 
@@ -171,17 +170,6 @@ def _by_flash(films: Mapping[str, Film]) -> Offsets:
     return Offsets("flash", seconds, spread, {name: RESOLUTION / float(film.rate) for name, film in films.items()})
 
 
-def _check_agreement(films: Mapping[str, Film], offsets: Offsets, rate: float) -> None:
-    for name, film in films.items():
-        spread = offsets.spread[name] * rate
-        if spread > LIMIT:
-            raise DataError(
-                f"{name} ({film.path.name}): its offsets by {offsets.method} at different times disagree by "
-                f"{spread:.2f} frames, allowed {LIMIT:g}: its clock runs apart, or frames are missing. Cut the film "
-                "shorter around what you need, or choose another --sync."
-            )
-
-
 def _step(name: str, film: Film, rate: Fraction) -> int:
     ratio, unsure = float(film.rate / rate), 2 * film.jitter / float(film.times[-1] - film.times[0])
     step = round(ratio)
@@ -211,14 +199,9 @@ def _common(films: Mapping[str, Film], offsets: Offsets, rate: Fraction, start: 
 
 
 def _aligned(
-    films: Mapping[str, Film],
-    offsets: Offsets,
-    rate: Fraction,
-    reference: str,
-    window: tuple[float, float],
-    steps: Mapping[str, int],
-    most: int | None,
-) -> Alignment:
+    films: Mapping[str, Film], offsets: Offsets, rate: Fraction, reference: str, window: tuple[float, float],
+    steps: Mapping[str, int], most: int | None,
+) -> Alignment:  # fmt: skip
     world = {name: film.times + offsets.seconds[name] for name, film in films.items()}
     own, slack = world[reference], 1e-6 / float(rate)
     inside = own[(own >= window[0] - slack) & (own <= window[1] + slack)]
@@ -252,36 +235,15 @@ def _rounding(film: Film, rate: Fraction) -> float:
     return 1e-6 + 0.5 * float(film.time_base * rate)
 
 
-def _refuse(film: Film, name: str, k: int, residual: float, alignment: Alignment) -> None:
-    shortest, longest = (1000 * interval for interval in film.intervals)
-    why = (
-        f"Its frames come {shortest:.1f} to {longest:.1f} ms apart: the rate varies or frames are missing. Record at a "
-        "constant rate, or cut the film before the gap (--start, --duration)."
-        if film.variable
-        else "Check its offset and rate, or leave the camera out."
-    )
-    raise DataError(
-        f"{name} ({film.path.name}): output frame {k}: its nearest frame ({alignment.frames[name][k]}) is "
-        f"{residual:+.2f} frames from its place on the times of {alignment.reference}, allowed {LIMIT:g}. {why}"
-    )
-
-
 def facts(film: Film, name: str, offsets: Offsets, alignment: Alignment) -> dict[str, Any]:
     """Entry of one camera in the manifest, as plain data."""
-    residual, frames = alignment.residuals[name], alignment.frames[name]
+    residual, frames, rate = alignment.residuals[name], alignment.frames[name], float(film.rate)
+    later = offsets.seconds[name] - offsets.seconds[alignment.reference]
     return {
-        "fps": float(film.rate),
-        "variable_rate": film.variable,
-        "frames": len(film),
-        "size": list(film.size),
-        "rotation": film.rotation,
-        "codec": film.codec,
-        "offset_seconds": offsets.seconds[name] - offsets.seconds[alignment.reference],
-        "offset_frames": (offsets.seconds[name] - offsets.seconds[alignment.reference]) * float(film.rate),
-        "resolution_frames": offsets.resolution[name] * float(film.rate),
-        "disagreement_frames": offsets.spread[name] * float(film.rate),
+        "fps": rate, "variable_rate": film.variable, "frames": len(film), "size": list(film.size),
+        "rotation": film.rotation, "codec": film.codec, "offset_seconds": later, "offset_frames": later * rate,
+        "resolution_frames": offsets.resolution[name] * rate, "disagreement_frames": offsets.spread[name] * rate,
         "residual_frames": {"mean": float(residual.mean()), "largest": float(np.abs(residual).max())},
-        "kept": [int(frames[0]), int(frames[-1])],
-        "left_out": [int(frames[0]), int(len(film) - 1 - frames[-1])],
+        "kept": [int(frames[0]), int(frames[-1])], "left_out": [int(frames[0]), int(len(film) - 1 - frames[-1])],
         "repeated": int((np.diff(frames) == 0).sum()),
-    }
+    }  # fmt: skip

@@ -23,11 +23,7 @@ class Take:
     labels: Mapping[str, str]  # what the user calls each camera
 
     def camera(self, name: str, what: str) -> str:
-        """The camera that the user calls so, by the output's name or the film's.
-
-        Raises:
-            DataError: there is none.
-        """
+        """The camera that the user calls so, by the output's name or the film's."""
         for camera, label in self.labels.items():
             if name in (camera, label):
                 return camera
@@ -39,9 +35,6 @@ def find_takes(path: Path) -> list[Take]:
 
     It holds one folder per sequence, each with one film per camera, named alike in all; or the films of a single
     sequence. Cameras become cam_0, cam_1 … in the natural order of their names, sequences seq_000 … in that of theirs.
-
-    Raises:
-        DataError: nothing is there, it is ambiguous, or cameras differ between sequences.
     """
     if not path.is_dir():
         raise DataError(f"{path}: no such folder. Expected one of films, or one folder of films per sequence.")
@@ -66,11 +59,7 @@ def find_takes(path: Path) -> list[Take]:
 
 
 def offset_seconds(text: str, rate: float) -> float:
-    """Seconds of an offset as people write it: ``0.146``, ``0.146s``, or ``7.3f`` in frames of that camera.
-
-    Raises:
-        DataError: it is none.
-    """
+    """Seconds of an offset as people write it: ``0.146``, ``0.146s``, or ``7.3f`` in frames of that camera."""
     match = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)\s*([sf]?)\s*", text)
     value = float(match[1]) if match else math.nan
     if match is None or not math.isfinite(value):

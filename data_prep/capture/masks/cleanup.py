@@ -37,17 +37,11 @@ UNTOUCHED = Cleanup(radius=0, holes=0.0, components=0, least=0.0, edge=0.0, reac
 
 
 def steady(mask: np.ndarray, neighbours: Sequence[tuple[int, np.ndarray]], motion: float) -> np.ndarray:
-    """A mask that differs from its neighbours in time only by what motion explains.
+    """A mask (H, W) that differs from its neighbours in time only by what ``motion`` [pixels per frame] explains.
 
-    With a tolerance of m pixels per frame, a neighbour at distance d says that a pixel's alpha lies between the
-    smallest and the largest alpha that it has within m·d pixels. The mask is moved between bounds with which the
-    majority of frames, itself included, agree. So what flashes up or drops out for a frame goes, and what sways stays,
-    except for parts thinner than the tolerance that move further than it.
-
-    Args:
-        mask: (H, W) float32 in 0..1.
-        neighbours: distance in frames and mask of each.
-        motion: tolerance [pixels per frame].
+    A neighbour at distance d [frames] says that a pixel's alpha lies between the smallest and the largest alpha that it
+    has within ``motion`` d pixels. The mask is moved between bounds with which the majority of frames agree. So what
+    flashes up or drops out for a frame goes, and what sways stays.
     """
     agreeing = len(neighbours) // 2
     if agreeing == 0:

@@ -45,11 +45,7 @@ class Clip:
 
 
 def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
-    """All folders with pictures in ``root``, each a clip.
-
-    Raises:
-        DataError: there are none, or two pictures would become one PNG.
-    """
+    """All folders with pictures in ``root``, each a clip."""
     folders: dict[str, list[Path]] = {}
     for path in root.rglob("*"):
         relative = path.relative_to(root)

@@ -70,11 +70,7 @@ class OnnxSegmenter:
         return lambda index: self.mask(clip.rgb(index))
 
     def mask(self, rgb: np.ndarray) -> np.ndarray:
-        """The mask of an (H, W, 3) uint8 picture, (H, W) float32 in 0..1.
-
-        Raises:
-            DataError: the network fails, or gives no map of numbers in 0..1.
-        """
+        """The mask of an (H, W, 3) uint8 picture, (H, W) float32 in 0..1."""
         options, (height, width) = self._options, rgb.shape[:2]
         values = cv2.resize(rgb, self._size, interpolation=cv2.INTER_LINEAR).astype(np.float32)
         values = (values - np.array(options.onnx_mean, np.float32)) / np.array(options.onnx_scale, np.float32)

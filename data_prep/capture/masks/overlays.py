@@ -21,7 +21,7 @@ SHEET = 12
 
 def overlay(rgb: np.ndarray, alpha: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Left the picture with the background dimmed and the mask's outline, right what was cut out; each of ``size``."""
-    rgb, alpha = fitted(rgb, size), fitted(alpha, size)
+    rgb, alpha = (cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in (rgb, alpha))
     weight = alpha[..., None].astype(np.float32) / 255
     left = rgb * (0.35 + 0.65 * weight)
     inside = (alpha > 127).astype(np.uint8)
@@ -29,18 +29,6 @@ def overlay(rgb: np.ndarray, alpha: np.ndarray, size: tuple[int, int]) -> np.nda
     left[outline] = OUTLINE
     right = rgb * weight + np.array(GROUND, np.float32) * (1 - weight)
     return np.ascontiguousarray(np.concatenate([left, right], axis=1).astype(np.uint8))
-
-
-def fitted(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Scaled into a box of (width, height), centred on black."""
-    height, width = pixels.shape[:2]
-    scale = min(size[0] / width, size[1] / height)
-    inner = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(pixels, inner, interpolation=cv2.INTER_AREA)
-    found = np.zeros((size[1], size[0], *pixels.shape[2:]), np.uint8)
-    top, left = (size[1] - inner[1]) // 2, (size[0] - inner[0]) // 2
-    found[top : top + inner[1], left : left + inner[0]] = small
-    return found
 
 
 def write_overlays(clip: Clip, masks: Sequence[Path], folder: Path, *, fps: float) -> None:
