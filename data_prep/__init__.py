@@ -1,1 +1,5 @@
-"""Makes data sets. A file that cannot be used raises a ``DataError`` with file, field and remedy, whoever reads it."""
+"""Makes data sets.
+
+A file that cannot be used raises a ``DataError`` with file, field and remedy, an option that does not suit a
+``ConfigError`` with its name, whoever reads it.
+"""

@@ -15,12 +15,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec import Struct
+
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
 from data_prep.common.objects import described, object_facts, refuse_faults, train_command
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, copy_missing, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
+from gausim.io.plain_json import checked
 
 if TYPE_CHECKING:
     from data_prep.ready.gathered import Gathered
@@ -50,15 +53,19 @@ class AssembleOptions(Options):
     )
 
 
+class _Given(Struct):
+    """Fields of a ``dataset.json`` beside the pictures that matter here."""
+
+    name: str | None = None
+    fps: float | None = None
+    heldout_views: list[str] | None = None
+    train_frames: tuple[int, int] | None = None
+
+
 def assemble(
-    pictures: Sequence[Path],
-    out: Path,
-    options: AssembleOptions | None = None,
-    *,
-    scene: Path | None = None,
-    overwrite: bool = False,
-    tick: Tick = silent,
-) -> dict[str, Any]:
+    pictures: Sequence[Path], out: Path, options: AssembleOptions | None = None, *, scene: Path | None = None,
+    force: bool = False, tick: Tick = silent,
+) -> dict[str, Any]:  # fmt: skip
     """Runs the stage.
 
     Raises:
@@ -67,58 +74,38 @@ def assemble(
     """
     from data_prep.ready.gathered import gather
 
-    options = options or AssembleOptions()
-    found = gather(pictures)
+    options, found = options or AssembleOptions(), gather(pictures)
     if not found.sequences:
         raise DataError(
             f"{pictures[0]}: has no sequences, and dynamics are learned from them. For a scene from photos alone leave "
             "this stage out: reconstruct the folder itself."
         )
-    facts = dataset_facts(found, options, out.name)
+    facts = _facts(found, options, out.name)
     files = {**dict(found.files()), **(_scene_files(scene) if scene is not None else {})}
     stage = Stage("assemble", REVISION, files, {"facts": facts, **asdict(options)})
-    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), overwrite=overwrite)
+    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), force=force)
 
 
-def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
-    """The content of ``dataset.json``.
-
-    Raises:
-        DataError: cameras or rates of the sequences differ, or a sequence is too short.
-        ConfigError: an option does not suit the pictures.
-    """
-    from data_prep.ready.gathered import common_rate, common_views
-
-    given = _checked(found.facts)
-    views = common_views(found.sequences)
-    fps = options.fps or common_rate(found.sequences) or given.get("fps")
+def _facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
+    """The content of ``dataset.json``."""
+    given = checked(dict(found.facts), _Given, "dataset.json", "Correct it beside the pictures.")
+    views, fps = found.views, options.fps or found.fps or given.fps
     if fps is None:
         raise ConfigError("--fps: the sequences do not say how many frames per second they have; state it.")
-    heldout = options.heldout
+    heldout = options.heldout if options.heldout is not None else given.heldout_views
     if heldout is None:
-        heldout = given.get("heldout_views", views[-1:] if len(views) >= ENOUGH_VIEWS else ())
-    unknown = [view for view in heldout if view not in views]
-    if unknown or len(set(heldout)) >= len(views):
-        raise ConfigError(f"--heldout {','.join(map(str, heldout))}: expected a part of the cameras {list(views)}.")
+        heldout = views[-1:] if len(views) >= ENOUGH_VIEWS else ()
+    if not set(heldout) < set(views):
+        raise ConfigError(f"--heldout {','.join(heldout)}: expected a part of the cameras {list(views)}.")
     lengths = {name: _length(posed.frames) for name, posed in found.sequences.items()}
     shortest = min(lengths, key=lambda name: lengths[name])
-    wanted = options.train_frames or given.get("train_frames", [0, min(TRAIN_FRAMES, lengths[shortest])])[1]
+    wanted = options.train_frames or (given.train_frames or (0, min(TRAIN_FRAMES, lengths[shortest])))[1]
     if not 2 <= wanted <= lengths[shortest]:
         raise ConfigError(
             f"--train-frames {wanted}: {shortest} has {lengths[shortest]} frames; expected 2 to {lengths[shortest]}, "
             "or leave that sequence out."
         )
-    return given | object_facts(options.name or given.get("name") or name, fps, views, heldout, wanted)
-
-
-def _checked(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Valid entries of a ``dataset.json`` beside the pictures."""
-    heldout, frames = facts.get("heldout_views", []), facts.get("train_frames", [0, 2])
-    if not isinstance(heldout, list) or not all(isinstance(view, str) for view in heldout):
-        raise DataError(f"dataset.json: field 'heldout_views' must be a list of camera names, got {heldout!r}.")
-    if not isinstance(frames, list) or len(frames) != 2 or not all(type(n) is int for n in frames):
-        raise DataError(f"dataset.json: field 'train_frames' must be [0, first unseen frame], got {frames!r}.")
-    return dict(facts)
+    return dict(found.facts) | object_facts(options.name or given.name or name, fps, views, heldout, wanted)
 
 
 def _length(frames: Sequence[Any]) -> int:
@@ -166,7 +153,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
         options = chosen(AssembleOptions, given)
-        manifest = assemble(given.pictures, given.out, options, scene=given.scene, overwrite=given.overwrite, tick=tick)
+        manifest = assemble(given.pictures, given.out, options, scene=given.scene, force=given.force, tick=tick)
         return f"{headline(given.out, manifest)}\n{summary(manifest['results'], given.out)}"
 
     return run_command(parser, argv, run)

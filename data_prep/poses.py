@@ -160,10 +160,7 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
     """Text that the command prints."""
     results = manifest["results"]
     error, world = results["reprojection"], results["world"]
-    lines = [
-        headline(out, manifest),
-        f"registered     {results['registered']} of {results['images']} images",
-    ]
+    lines = [headline(out, manifest), f"registered     {results['registered']} of {results['images']} images"]
     for photo in results["failed"]:
         facts = f"{photo['features']} features, {photo['matches']} matches"
         lines.append(f"  without pose {photo['name']} ({facts}): {photo['remedy']}")

@@ -11,35 +11,20 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from data_prep.blender import plan as planned
 from data_prep.blender.environment import BlenderError, BlenderProcess
 from data_prep.blender.meshes import Surface, make_surface, read_mesh
-from data_prep.blender.plan import (
-    FPS,
-    Plan,
-    action,
-    dataset_facts,
-    frame_entries,
-    frame_name,
-    intrinsics,
-    sequence_folder,
-    sequence_job,
-    still_entries,
-    still_job,
-)
-from data_prep.common.photos import write_picture
+from data_prep.blender.plan import FPS, Plan, action, intrinsics, sequence_folder
 from data_prep.common.progress import Tick
 from data_prep.common.stage import PLAN, files_in, write_npz
 from gausim.core import DataError
-from gausim.data.images import read_rgba
 from gausim.io.files import write_json
 from gausim.io.npz import read_array
 
 FACTS = "dataset.json"
 STILLS_PER_JOB = 20
-OVERVIEW_FRAMES, OVERVIEW_SIDE = 5, 200
 
 
 def make_images(
@@ -58,12 +43,12 @@ def make_images(
     # Absolute: Blender has a working directory of its own mind.
     root = work.absolute()
     versions = blender.versions()
-    _start(root, {**dataset_facts(plan, surface), "blender": versions})
+    _start(root, {**planned.dataset_facts(plan, surface), "blender": versions})
     write_npz(root / "rest_mesh.npz", **vars(surface))
-    stills, frames = still_entries(plan, surface), frame_entries(plan, surface)
+    stills, frames = planned.still_entries(plan, surface), planned.frame_entries(plan, surface)
     parts = [stills[i : i + STILLS_PER_JOB] for i in range(0, len(stills), STILLS_PER_JOB)]
-    jobs = [still_job(plan, surface, root, part) for part in parts]
-    jobs += [sequence_job(plan, surface, root, number, frames) for number in range(plan.sequences)]
+    jobs = [planned.still_job(plan, surface, root, part) for part in parts]
+    jobs += [planned.sequence_job(plan, surface, root, number, frames) for number in range(plan.sequences)]
     _run(jobs, blender, workers, tick)
     lens = intrinsics(plan.pictures.still_resolution)
     write_json(root / "static" / "transforms.json", {**lens, "frames": stills})
@@ -72,7 +57,6 @@ def make_images(
     for number in range(plan.sequences):
         write_json(sequence_folder(root, number) / "transforms.json", video)
         sequences.append(_describe_sequence(root, plan, surface, number))
-    _write_overview(root, plan)
     for half in (path for path in root.rglob(".*") if path.is_file()):
         half.unlink()  # of a Blender that was killed
     images = len(stills) + plan.sequences * len(frames)
@@ -163,17 +147,3 @@ def _motion(path: Path, plan: Plan) -> tuple[float, np.ndarray]:
             "Remove it and run the command again."
         )
     return float(strength), np.linalg.norm(displacement, axis=-1).max(1)
-
-
-def _write_overview(root: Path, plan: Plan) -> None:
-    """``overview.png``: a row for each of the first sequences' views, frames from left to right."""
-    frames = np.unique(np.linspace(0, plan.frames - 1, OVERVIEW_FRAMES).round().astype(int))
-    scale = OVERVIEW_SIDE / max(plan.pictures.resolution)
-    size = tuple(max(1, round(side * scale)) for side in plan.pictures.resolution)
-    rows = []
-    for number in range(min(plan.sequences, 6)):
-        folder, view = sequence_folder(root, number), plan.view_names[number % plan.views]
-        pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.pictures.resolution) for frame in frames]
-        shown = [picture[..., :3] * (picture[..., 3:] / 255) for picture in pictures]
-        rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))
-    write_picture(root / "overview.png", np.vstack(rows), 3)

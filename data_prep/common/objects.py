@@ -44,11 +44,7 @@ def train_command(name: str, out: Path) -> str:
 
 
 def refuse_faults(work: Path, out: Path) -> None:
-    """Checks the object in ``work``, which is to become ``out``, as `gausim verify` does.
-
-    Raises:
-        DataError: with its first faults.
-    """
+    """Checks the object in ``work``, which is to become ``out``, as `gausim verify` does."""
     from gausim.data.verify import verify
 
     faults = verify(work)

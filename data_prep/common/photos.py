@@ -14,15 +14,7 @@ import numpy as np
 
 from gausim.core.errors import DataError
 from gausim.io.files import natural, write_durably
-from gausim.io.pixels import (
-    ORIENTATION,
-    QUARTER_TURNS,
-    decode,
-    decode_tiff,
-    exif_turned,
-    palette_indices,
-    read_header,
-)
+from gausim.io.pixels import ORIENTATION, QUARTER_TURNS, decode, decode_tiff, exif_turned, palette_indices, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # Pictures that no stage reads.

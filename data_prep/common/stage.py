@@ -43,11 +43,7 @@ class Stage:
     packages: Sequence[str] = ()  # libraries whose versions may matter; recorded, not compared
 
     def key(self) -> dict[str, Any]:
-        """Identity of a result: name and revision of the stage, settings, and the inputs' hashes.
-
-        Raises:
-            DataError: an input is missing.
-        """
+        """Identity of a result: name and revision of the stage, settings, and the inputs' hashes."""
         settings = json.loads(json.dumps(self.settings))
         inputs = {name: fingerprint(path) for name, path in sorted(self.inputs.items())}
         return {"stage": self.name, "revision": self.revision, "settings": settings, "inputs": inputs}
@@ -67,9 +63,6 @@ def run_stage(
 
     Returns:
         The manifest; ``"made"`` (not in the file) tells whether there was anything to do.
-
-    Raises:
-        DataError: ``out`` holds something else; nothing was touched.
     """
     key, old = stage.key(), out.with_name(f".{out.name}.old")
     known = _known(out, key, overwrite=overwrite)
@@ -94,11 +87,7 @@ def run_stage(
 
 
 def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
-    """The manifest of a finished stage.
-
-    Raises:
-        DataError: it is missing, broken, or of another stage than asked for.
-    """
+    """The manifest of a finished stage."""
     path = folder / MANIFEST
     if not path.is_file():
         raise DataError(f"{path}: not found. Is this a finished stage? Run `gausim prepare {stage or 'STAGE'}`.")
@@ -113,11 +102,7 @@ def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
 
 
 def fingerprint(path: Path) -> dict[str, Any]:
-    """Size and SHA-256 of a file.
-
-    Raises:
-        DataError: there is no such file.
-    """
+    """Size and SHA-256 of a file."""
     if not path.is_file():
         raise DataError(f"{path}: not found, or not a file.")
     return {"bytes": path.stat().st_size, "sha256": sha256(path)}

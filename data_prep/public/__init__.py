@@ -34,12 +34,7 @@ PACKAGES = ("av", "numpy", "opencv-python-headless", "pycolmap", "scipy")
 def import_public(
     kind: str, root: Path, out: Path, options: Any = None, *, force: bool = False, tick: Tick = silent
 ) -> dict[str, Any]:
-    """Reads the object of a kind of set in ``root``, writes it to ``out`` and returns the manifest.
-
-    Raises:
-        DataError: a file is missing or malformed, parts do not go together, or the object would have faults.
-        ConfigError: an option does not suit the folder.
-    """
+    """Reads the object of a kind of set in ``root``, writes it to ``out`` and returns the manifest."""
     from data_prep.public.writer import ObjectWriter
 
     reader = import_module(f"data_prep.public.{kind}")

@@ -47,12 +47,7 @@ class Options(ImportOptions):
 
 
 def read(root: Path, options: Options) -> PublicObject:
-    """One object.
-
-    Raises:
-        DataError: poses, photos, a film, a mask or the scene are missing or malformed.
-        ConfigError: no still, or more than one, was the films' place.
-    """
+    """One object."""
     if (root / BLENDER).is_file():
         shots, files = read_lens_transforms(root / BLENDER), {BLENDER: root / BLENDER}
     else:

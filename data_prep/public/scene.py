@@ -108,13 +108,7 @@ class PublicObject:
         return {**self.files, **{Path(os.path.relpath(path, self.root)).as_posix(): path for path in sorted(found)}}
 
     def checked(self) -> PublicObject:
-        """Itself, or an error where its parts do not go together.
-
-        Raises:
-            DataError: two sequences or stills have one name, cameras have different numbers of frames, or there are
-                fewer frames than are to be trained on.
-            ConfigError: held-out cameras are no part of the cameras.
-        """
+        """Itself, or an error where its parts do not go together."""
         sequences, stills = [motion.name for motion in self.motions], [view.name for view, _ in self.stills]
         for what, found in (("sequences", sequences), ("stills", stills)):
             twice = sorted({name for name in found if found.count(name) > 1})

@@ -21,21 +21,29 @@ class Gathered:
     """Posed pictures of one object, before they are brought together."""
 
     stills: PosedImages | None  # those of the rest state; None where there are none
-    sequences: Mapping[str, PosedImages]  # by name
+    sequences: Mapping[str, PosedImages]  # by name, all with the same cameras and rate
     facts: Mapping[str, Any]  # what a ``dataset.json`` beside them says already
     points: Path | None  # points to begin a reconstruction with, where there are some
 
     def files(self) -> Iterator[tuple[str, Path]]:
         """Every file to copy, by its name in the assembled object."""
         sets = {f"sequences/{name}": posed for name, posed in self.sequences.items()}
-        if self.stills is not None:
-            sets = {"static": self.stills, **sets}
-        for place, posed in sets.items():
+        for place, posed in (({"static": self.stills} if self.stills is not None else {}) | sets).items():
             yield f"{place}/{TRANSFORMS}", posed.path
             for name in dict.fromkeys(_inside(posed.path, frame.path) for frame in posed.frames):
                 yield f"{place}/{name}", posed.path.parent / name
         if self.points is not None:
             yield POINTS, self.points
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The cameras, in natural order."""
+        return _views(next(iter(self.sequences.values())))
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second that the sequences state; None where none does."""
+        return next((posed.fps for posed in self.sequences.values() if posed.fps is not None), None)
 
 
 def gather(folders: Sequence[Path]) -> Gathered:
@@ -59,6 +67,7 @@ def gather(folders: Sequence[Path]) -> Gathered:
         facts.update(read_json(folder / FACTS) if (folder / FACTS).is_file() else {})
         points = folder / POINTS if (folder / POINTS).is_file() else points
     ordered = {name: sequences[name] for name in sorted(sequences, key=natural)}
+    _check_alike(ordered)
     return Gathered(stills, ordered, facts, points)
 
 
@@ -97,22 +106,19 @@ def _inside(transforms: Path, picture: Path) -> str:
         raise DataError(f"{transforms}: names {picture}, which lies outside of its folder. Move it there.") from None
 
 
-def common_views(sequences: Mapping[str, PosedImages]) -> tuple[str, ...]:
-    """The cameras of all sequences, in natural order."""
-    views = {name: tuple(sorted({f.camera for f in s.frames}, key=natural)) for name, s in sequences.items()}
-    first = next(iter(views))
-    for name, found in views.items():
-        if found != views[first]:
-            raise DataError(
-                f"{sequences[name].path}: has the cameras {list(found)}, {first} has {list(views[first])}. Every "
-                "sequence of an object needs the same: leave this sequence out, or assemble it as an object of its own."
-            )
-    return views[first]
+def _views(posed: PosedImages) -> tuple[str, ...]:
+    return tuple(sorted({frame.camera for frame in posed.frames}, key=natural))
 
 
-def common_rate(sequences: Mapping[str, PosedImages]) -> float | None:
-    """Frames per second that the sequences state; None where none does."""
+def _check_alike(sequences: Mapping[str, PosedImages]) -> None:
+    """Raises where two sequences have different cameras or rates."""
     rates = {name: posed.fps for name, posed in sequences.items() if posed.fps is not None}
     if len(set(rates.values())) > 1:
         raise DataError(f"sequences have different rates [frames per second]: {rates}. Ingest them with one --fps.")
-    return next(iter(rates.values()), None)
+    views = {name: list(_views(posed)) for name, posed in sequences.items()}
+    for name, found in views.items():
+        if found != (expected := next(iter(views.values()))):
+            raise DataError(
+                f"{sequences[name].path}: has the cameras {found}, {next(iter(views))} has {expected}. Every sequence "
+                "of an object needs the same: leave this sequence out, or assemble it as an object of its own."
+            )

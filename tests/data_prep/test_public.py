@@ -55,9 +55,7 @@ def check_views(data: ObjectData, sample: Sample, tolerance: float) -> None:
             assert np.abs(pixels[frame, view][both].astype(float) - truth[both]).mean() < tolerance
 
 
-FALLS = [
-    ("springgaus", {}, 1 / 0.03, [0, -9.8, 0], ([0, 0.3, 0], [0, 1, 0]), 1.0),
-]
+FALLS = [("springgaus", {}, 1 / 0.03, [0, -9.8, 0], ([0, 0.3, 0], [0, 1, 0]), 1.0)]
 
 
 @pytest.mark.parametrize(("kind", "options", "fps", "gravity", "floor", "tolerance"), FALLS, ids=lambda v: str(v)[:10])

@@ -63,9 +63,9 @@ def agreement(masks: list[np.ndarray]) -> float:
     return min(overlap(mask, disc(k).astype(np.uint8) * 255) for k, mask in enumerate(masks))
 
 
-@pytest.mark.parametrize("options", [[], ["--no-grabcut", "--plate", "PLATE"], ["--plate", "PLATES"]])
+@pytest.mark.parametrize("options", [["--no-grabcut", "--plate", "PLATE"], ["--plate", "PLATES"]])
 def test_background_difference_finds_what_moves(film: Path, tmp_path: Path, options: list[str]) -> None:
-    """Against the median over time, a picture of the empty scene, and one per camera."""
+    """Against a picture of the empty scene, and one per camera."""
     empty = picture(-20)
     write(tmp_path / "plates" / "cam_0.png", empty)
     places = {"PLATE": write(tmp_path / "empty.png", empty), "PLATES": tmp_path / "plates"}
@@ -129,8 +129,8 @@ def test_poses_are_carried_over(tmp_path: Path) -> None:
 
 
 def test_a_film_can_be_segmented_directly(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mp4", map(picture, range(FRAMES)), 25)
-    assert main([str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "out"), "--backend", "background"]) == 0
+    write_video(tmp_path / "clip.mp4", (picture(k, (0, 177, 64)) for k in range(FRAMES)), 25)
+    assert main([str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "out"), "--backend", "chroma"]) == 0
     masks = [read_picture(p)[..., 3] for p in sorted((tmp_path / "out" / "clip").glob("*.png"))]
     assert len(masks) == FRAMES and agreement(masks) > 0.85
 

@@ -74,10 +74,6 @@ def place(found: Sequence[Posed], options: WorldOptions, *, mapped: bool) -> tup
     A world found from photos (``mapped``) has neither up, origin nor scale: it is turned upright, its origin becomes
     the point that the cameras look at, and without a scale the cameras are one unit from it on average. A world
     that is taken over stays as it is unless something is asked for.
-
-    Raises:
-        ConfigError: an option is malformed.
-        DataError: up cannot be told from the cameras.
     """
     viewmats = np.stack([shot.viewmat for shot in found])
     rule = options.up if options.up is not None else ("cameras" if mapped else "keep")

@@ -46,18 +46,15 @@ GROUPS = {"backends masks, background and chroma": ScreenOptions, "backend onnx"
 
 
 def make_backend(name: str, screen: ScreenOptions, network: NetworkOptions) -> Backend:
-    """The backend of a name.
-
-    Raises:
-        ConfigError: an option that it needs is missing, or a package.
-        DataError: a file of it is unusable.
-    """
+    """The backend of a name."""
     refine = not screen.no_grabcut
     if name == "masks":
         if screen.masks is None:
             raise ConfigError("--backend masks: name their folder with --masks DIR.")
         return Backend(name, lambda clip: _given_masks(clip, screen.masks), True, inputs=_files_in(screen.masks))
     if name == "background":
+        if screen.plate is None:
+            raise ConfigError("--backend background: name a picture of the empty scene with --plate.")
         settings: dict[str, Any] = {"threshold": screen.threshold, "grabcut": refine}
         segmenter = BackgroundSegmenter(screen.plate, screen.threshold, refine)
         return Backend(name, segmenter.open, settings=settings, inputs=_files_in(screen.plate))

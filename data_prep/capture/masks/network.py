@@ -41,12 +41,7 @@ class OnnxSegmenter:
     """Any network that maps one picture, (1, 3, H, W) float32, to one map of saliency."""
 
     def __init__(self, options: NetworkOptions) -> None:
-        """Loads the network.
-
-        Raises:
-            ConfigError: onnxruntime is not installed, or an option does not fit the network.
-            DataError: the file is no such network.
-        """
+        """Loads the network."""
         try:
             import onnxruntime
         except ImportError as error:

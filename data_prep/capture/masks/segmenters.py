@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from gausim.core import DataError
 
 MaskOf = Callable[[int], np.ndarray]
 
-# Frames that the median of a clip is made of.
-MEDIAN_FRAMES = 41
+# Frames that tell the noise of a clip.
+NOISE_FRAMES = 15
 # A difference in CIE Lab counts from here on, and from so many times the noise; 2.3 is just noticeable.
 LEAST_DIFFERENCE, OVER_NOISE = 7.0, 5.0
 # Distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not.
@@ -56,38 +56,25 @@ def alpha_masks(clip: Clip) -> MaskOf:
 
 @dataclass(frozen=True)
 class BackgroundSegmenter:
-    """Pixels that differ from the empty scene, or, without a picture of it, from the median over time.
+    """Pixels that differ from the empty scene."""
 
-    The median holds whatever stays in its place. It removes the background of an object that leaves its place now and
-    then; of one that sways about it only the swaying parts are found, and GrabCut spreads them over what looks alike.
-    """
-
-    # picture of the empty scene, or a folder with one per camera (named like the clip's folder); None: median
-    plate: Path | None = None
+    plate: Path  # picture of the empty scene, or a folder with one per camera (named like the clip's folder)
     threshold: float | None = None  # difference in CIE Lab from which a pixel counts; from the noise when None
     grabcut: bool = True  # refine by GrabCut
 
     def open(self, clip: Clip) -> MaskOf:
         """See :class:`Backend`."""
-        if self.plate is None and (not clip.moving or len(clip) < 3):
-            raise DataError(
-                f"{clip.root / clip.name}: a median over time needs a film of at least 3 frames of a camera that "
-                "stands still. Give a picture of the empty scene with --plate, or choose another --backend."
-            )
-        chosen = sampled(len(clip), MEDIAN_FRAMES)
-        background = lab(_read_plate(self.plate, clip) if self.plate else median_picture(clip, chosen))
-        differences = [difference(lab(clip.rgb(i)), background, clip, i) for i in chosen]
-        noise = 1.4826 * float(np.median([np.median(d) for d in differences]))
+        background = lab(_read_plate(self.plate, clip))
+        far = [difference(lab(clip.rgb(i)), background, clip, i) for i in sampled(len(clip), NOISE_FRAMES)]
+        noise = 1.4826 * float(np.median([np.median(d) for d in far]))
         threshold = self.threshold or max(LEAST_DIFFERENCE, OVER_NOISE * noise)
-        # Where anything ever moved: with a median, the object is somewhere in there and nowhere else.
-        ever = None if self.plate else np.max(differences, axis=0) > threshold
 
         def mask(index: int) -> np.ndarray:
             rgb = clip.rgb(index)
             far = difference(lab(rgb), background, clip, index)
             if not self.grabcut:
                 return np.clip((far - 0.5 * threshold) / threshold, 0, 1).astype(np.float32)
-            return grabcut(rgb, trimap(far, threshold, ever=ever))
+            return grabcut(rgb, trimap(far, threshold))
 
         return mask
 
@@ -154,29 +141,15 @@ def difference(picture: np.ndarray, background: np.ndarray, clip: Clip, index: i
     return np.asarray(np.linalg.norm(delta - np.median(delta, axis=(0, 1)), axis=-1))
 
 
-def median_picture(clip: Clip, indices: Sequence[int]) -> np.ndarray:
-    """Median of some pictures of a clip, (H, W, 3) uint8."""
-    pictures = [clip.rgb(i) for i in indices]
-    if len({p.shape for p in pictures}) > 1:
-        raise DataError(f"{clip.root / clip.name}: pictures have different sizes; those of a film have one.")
-    return np.median(pictures, axis=0).astype(np.uint8)
-
-
-def trimap(far: np.ndarray, threshold: float, *, ever: np.ndarray | None) -> np.ndarray:
-    """GrabCut's marks from (H, W) differences: the object is where they are large.
-
-    Differences from a median are no sure sign; with one the object is where anything ``ever`` moved, (H, W) bool.
-    """
+def trimap(far: np.ndarray, threshold: float) -> np.ndarray:
+    """GrabCut's marks from (H, W) differences: the object is where they are large."""
     margin = max(3, round(0.02 * max(far.shape))) | 1
     marks = np.full(far.shape, cv2.GC_BGD, np.uint8)
-    possible = (far > threshold if ever is None else ever).astype(np.uint8)
-    region = cv2.morphologyEx(possible, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    region = cv2.morphologyEx((far > threshold).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     near = cv2.dilate(region, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1)))
     marks[near > 0] = cv2.GC_PR_BGD
     marks[region > 0] = cv2.GC_PR_FGD
-    if ever is None:
-        core = cv2.erode((far > 2 * threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
-        marks[core > 0] = cv2.GC_FGD
+    marks[cv2.erode((far > 2 * threshold).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = cv2.GC_FGD
     return marks
 
 
