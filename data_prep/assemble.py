@@ -64,7 +64,7 @@ class _Given(Struct):
 
 def assemble(
     pictures: Sequence[Path], out: Path, options: AssembleOptions | None = None, *, scene: Path | None = None,
-    force: bool = False, tick: Tick = silent,
+    overwrite: bool = False, tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Runs the stage.
 
@@ -83,7 +83,7 @@ def assemble(
     facts = _facts(found, options, out.name)
     files = {**dict(found.files()), **(_scene_files(scene) if scene is not None else {})}
     stage = Stage("assemble", REVISION, files, {"facts": facts, **asdict(options)})
-    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), force=force)
+    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), overwrite=overwrite)
 
 
 def _facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
         options = chosen(AssembleOptions, given)
-        manifest = assemble(given.pictures, given.out, options, scene=given.scene, force=given.force, tick=tick)
+        manifest = assemble(given.pictures, given.out, options, scene=given.scene, overwrite=given.overwrite, tick=tick)
         return f"{headline(given.out, manifest)}\n{summary(manifest['results'], given.out)}"
 
     return run_command(parser, argv, run)

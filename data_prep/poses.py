@@ -35,7 +35,7 @@ _NAMED = 6
 
 
 def find_poses(
-    out: Path, sources: Sources, *, mapping: MappingOptions, world: WorldOptions | None = None, force: bool = False,
+    out: Path, sources: Sources, *, mapping: MappingOptions, world: WorldOptions | None = None, overwrite: bool = False,
     tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Runs the stage.
@@ -50,7 +50,7 @@ def find_poses(
     if sources.kind == "mapping":
         settings["mapping"] = {k: v for k, v in asdict(mapping).items() if k != "threads"}
     stage = Stage("poses", REVISION, material.inputs, settings, PACKAGES)
-    return run_stage(stage, out, lambda work: _make(work, material, mapping, world, tick), force=force)
+    return run_stage(stage, out, lambda work: _make(work, material, mapping, world, tick), overwrite=overwrite)
 
 
 def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldOptions, tick: Tick) -> dict[str, Any]:
@@ -149,7 +149,7 @@ def main(argv: list[str] | None = None) -> int:
     def run(arguments: argparse.Namespace, tick: Tick) -> str:
         manifest = find_poses(
             arguments.out, chosen(Sources, arguments), mapping=chosen(MappingOptions, arguments),
-            world=chosen(WorldOptions, arguments), force=arguments.force, tick=tick,
+            world=chosen(WorldOptions, arguments), overwrite=arguments.overwrite, tick=tick,
         )  # fmt: skip
         return _summary(arguments.out, manifest)
 

@@ -41,7 +41,7 @@ STEADY = 0.8
 
 def segment(
     source: Path, out: Path, backend: Backend, cleanup: Cleanup, *, kind: str = "auto", every: int = 1,
-    force: bool = False, tick: Tick = silent,
+    overwrite: bool = False, tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
     """Writes the pictures of ``source`` with their masks as alpha.
 
@@ -73,7 +73,7 @@ def segment(
             shutil.rmtree(work / folder, ignore_errors=True)
         return {"backend": backend.name, "clips": results}
 
-    return run_stage(Stage("segment", REVISION, inputs, settings, packages), out, make, force=force)
+    return run_stage(Stage("segment", REVISION, inputs, settings, packages), out, make, overwrite=overwrite)
 
 
 class _Run:
@@ -208,7 +208,7 @@ def main(argv: list[str] | None = None) -> int:
         cleanup = replace(UNTOUCHED if arguments.backend == "alpha" else Cleanup(), **given(Cleanup, arguments))
         manifest = segment(
             arguments.pictures, arguments.out, backend, cleanup,
-            kind=arguments.kind, every=arguments.every, force=arguments.force, tick=tick,
+            kind=arguments.kind, every=arguments.every, overwrite=arguments.overwrite, tick=tick,
         )  # fmt: skip
         return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"
 

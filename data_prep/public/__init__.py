@@ -32,7 +32,7 @@ PACKAGES = ("av", "numpy", "opencv-python-headless", "pycolmap", "scipy")
 
 
 def import_public(
-    kind: str, root: Path, out: Path, options: Any = None, *, force: bool = False, tick: Tick = silent
+    kind: str, root: Path, out: Path, options: Any = None, *, overwrite: bool = False, tick: Tick = silent
 ) -> dict[str, Any]:
     """Reads the object of a kind of set in ``root``, writes it to ``out`` and returns the manifest."""
     from data_prep.public.writer import ObjectWriter
@@ -48,7 +48,7 @@ def import_public(
     # Folders count by the files in them.
     settings = {name: value for name, value in asdict(options).items() if not isinstance(value, Path)}
     stage = Stage("public", REVISION, found.inputs(), {"kind": kind, **settings}, PACKAGES)
-    return run_stage(stage, out, make, force=force)
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -63,12 +63,12 @@ def main(argv: list[str] | None = None) -> int:
         )
         part.add_argument("root", type=Path, metavar="ROOT", help="folder in the layout of the set")
         part.add_argument("--out", type=Path, required=True, help="folder of the result")
-        part.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+        part.add_argument("--overwrite", action="store_true", help="replace a result of other inputs or settings")
         add_options(part.add_argument_group("what the set does not say, or may say otherwise"), reader.Options)
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
         options = chosen(readers[given.kind].Options, given)
-        manifest = import_public(given.kind, given.root, given.out, options, force=given.force, tick=tick)
+        manifest = import_public(given.kind, given.root, given.out, options, overwrite=given.overwrite, tick=tick)
         return f"{headline(given.out, manifest)}\n{summary(manifest['results'], given.out)}"
 
     return run_command(parser, argv, run)

@@ -148,7 +148,8 @@ FAULTS = {
         DataError, "lies outside",
     ),
     "facts": (
-        lambda toy: (toy.root / "dataset.json").write_text('{"train_frames": 16}'), DataError, "train_frames.*got 'int'",
+        lambda toy: (toy.root / "dataset.json").write_text('{"train_frames": 16}'), DataError,
+        "train_frames.*got 'int'",
     ),
     "no pins": (
         lambda toy: save_scene(replace(toy.scene, pinned=torch.zeros(toy.scene.count, dtype=torch.bool)),
