@@ -100,7 +100,7 @@ def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) ->
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--force", "weights=3"], "--force weights=3: 'direction=' is missing"),
+        (["--force", "weights=3"], "--force weights=3: force: Missing required argument 'direction'"),
         (["--force", "weights=heavy", "direction=x"], "'heavy': expected a number"),
         (["--force", "weights=nan", "direction=x"], "field 'weights': expected float >= 0.0, got 'nan'"),
         (["--force", "weights=11", "direction=x"], "'weights': expected at most 10"),
@@ -113,8 +113,8 @@ def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) ->
         (["--wind", "weights=1", "direction=x", "--sequences", "seq_000", "seq_001"], "name one of --objects"),
         (["--wind", "weights=1", "direction=x", "--sequences", "seq_009"], "has no sequence 'seq_009'"),
         (["--wind", "weights=1", "direction=x", "--cameras", "cam_9"], "cam_9"),
-        (["--wind", "weights=1", "direction=x", "--session", "s.json"], "no such file|has its own forces"),
-        (["--session", "none.json"], "none.json: no such file"),
+        (["--wind", "weights=1", "direction=x", "--session", "s.json"], "has its own forces"),
+        (["--session", "none.json"], "none.json: cannot be read .No such file"),
     ],
 )
 def test_wrong_words_are_named(played, monkeypatch, capsys, options: list[str], message: str) -> None:

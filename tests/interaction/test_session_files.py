@@ -81,9 +81,9 @@ def put(*path_and_value):
         (put("fps", float("nan")), "JSON is malformed"),
         (put("steps", 10**9), "field 'steps': expected int <= 100000, got '1000000000'"),
         (put("steps", 10), "event 9: field 'at': expected 9 to 10, got 20"),
-        (lambda v: v.pop("steps"), "missing: ..steps.."),
+        (lambda v: v.pop("steps"), "forcesession: Missing required argument .steps."),
         (put("made_with", "scene", 3), "'made_with': field 'scene': expected str"),
-        (put("made_with", "host", "x"), "unknown: ..host.."),
+        (put("made_with", "host", "x"), "madewith: Unexpected keyword argument .host."),
         (put("events", {}), "field 'events': expected a list"),
         (put("events", [3]), "event 0: expected an object"),
         (put("events", 4, "at", 2), "event 4: field 'at': expected 3 to 20, got 2"),
@@ -121,7 +121,7 @@ def test_what_is_no_session_is_refused(text: str, message: str) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch) -> None:
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="No such file"):
         load_session(tmp_path / "none.json")
     with pytest.raises(DataError, match="cannot be read"):
         load_session(tmp_path)
