@@ -71,7 +71,7 @@ $(DATA)/.made: | install
 	$(BIN)/gausim prepare synthesize --out $(DATA)
 	touch $@
 
-train: install ## Train: make train ARGS="experiment=demo seed=1"
+train: install ## Train: make train ARGS="data=demo seed=1"
 	$(BIN)/gausim train $(ARGS)
 
 evaluate: install ## Evaluate a run: make evaluate RUN=outputs/demo/seed_0
@@ -87,7 +87,7 @@ benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at ti
 	$(BIN)/python -m benchmarks $(or $(ARGS),all --quick)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, and a page about it
-	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train experiment=demo plan.epochs=6
+	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=6
 	$(BIN)/gausim evaluate outputs/demo/seed_0
 	$(BIN)/gausim report outputs/demo/seed_0
 

@@ -129,6 +129,6 @@ def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
     """The untrained simulator of ``conf/model/PRESET.yaml`` for a scene at 24 frames per second, with KEY=VALUE."""
     from gausim.compose.config import compose, instantiate
 
-    config = compose("train", [f"model={preset}", *(f"model.simulator.{setting}" for setting in settings)])
+    config = compose([f"model={preset}", *(f"model.simulator.{setting}" for setting in settings)])
     made: GausSim = instantiate(config.model.simulator)(scenes=[scene], fps=[24.0])
     return made

@@ -17,7 +17,7 @@ from gausim.training.module import GausSimModule
 
 SEQUENCES = 4  # of an optimiser step, at most
 SLOW_ROUNDS = 2  # timed steps of plain torch
-OVERRIDES, RIVAL = ("experiment=demo", "model=gausim"), "model=gausim_elastic"
+OVERRIDES, RIVAL = ("data=demo", "model=gausim"), "model=gausim_elastic"
 
 
 def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
@@ -30,7 +30,7 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
     from gausim.compose.config import compose
 
     words = list(overrides or OVERRIDES)
-    own, rival = compose("train", words), compose("train", [*(w for w in words if not w.startswith("model")), RIVAL])
+    own, rival = compose(words), compose([*(w for w in words if not w.startswith("model")), RIVAL])
     module, data = build(own)
     return measure(options, module, data, {} if own.model == rival.model else {RIVAL: build(rival)[0]})
 

@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import io
 import os
-import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -19,20 +18,11 @@ from mkdocs.structure.files import File, Files
 
 from gausim.cli.main import COMMANDS, command
 from gausim.cli.prepare import STAGES
-from gausim.compose.places import Place, option_of, read_places
-from gausim.compose.root import RootConfig, conf_dir
-from gausim.compose.schema import documented
+from gausim.compose.root import conf_dir, options
 
 # Files of these groups set keys of any other group: one table each, of what they set.
-RECIPES = {
-    "experiment": "Experiments",
-    "protocol": "Protocols",
-    "method": "Methods of comparisons",
-    "ablation": "Ablations",
-    "budget": "Budgets",
-    "sweep": "Sweeps",
-}
-GROUPS = ("data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "paths")
+RECIPES = {"experiment": "Experiments", "ablation": "Ablations"}
+GROUPS = ("model", "data", "supervision", "render", "trainer", "logger")
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -45,37 +35,32 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def configuration() -> str:
     """The page of all configuration groups, their files and their keys."""
-    places = read_places()
-    root = [(f"`{key}`", _cell(said)) for key, said in documented(RootConfig).items() if key not in GROUPS]
     parts = [
         "# Configuration",
-        "`gausim train KEY=VALUE …` sets keys, `GROUP=FILE` chooses a file of a group. An experiment may replace any "
-        "group, an ablation comes after it, and single keys of the command line come last. This page is made from "
-        "`conf/`; `gausim train --cfg job` prints the whole configuration, `gausim config validate` checks one.",
+        "`gausim train KEY=VALUE …` sets keys, `GROUP=FILE` chooses a file of a group. An experiment chooses files of "
+        "the other groups, an ablation comes after it, and what stands on the command line wins. This page is made "
+        "from `conf/`; `gausim train --cfg job` prints the whole configuration.",
         "## Root keys",
-        *_table(("key", "meaning"), root),
+        *_file("train.yaml"),
     ]
     for group in GROUPS:
         parts.append(f"## {group}")
-        for path in sorted((conf_dir() / group).glob("*.yaml")):
-            parts += _file(path, places.children.get(group, Place()))
+        for name in options(group):
+            parts += [f"### `{group}={name}`", *_file(f"{group}/{name}.yaml")]
     for group, title in RECIPES.items():
-        rows = [_recipe(path) for path in sorted((conf_dir() / group).rglob("*.yaml"))]
+        rows = [_recipe(group, name) for name in options(group)]
         parts += [f"## {title}", *_table((f"`{group}=`", "what it does", "what it sets"), rows)]
-    parts.append("## What files begin with")
-    for path in sorted((conf_dir() / "base").glob("*.yaml")):
-        parts += _file(path, places)
     return "\n\n".join(parts)
 
 
-def _file(path: Path, place: Place) -> Iterator[str]:
-    """Title, head comment and table of one file's keys."""
+def _file(name: str) -> Iterator[str]:
+    """Head comment and table of one file's keys."""
+    path = conf_dir() / name
     node, comments = yaml.safe_load(path.read_text()) or {}, _comments(path)
-    yield f"### `{path.parent.name}={path.stem}`"
     yield _head(path)
     inherited = ", ".join(_begins_with(node))
     yield f"It begins with {inherited}." if inherited else ""
-    rows = [(f"`{key}`", f"`{value}`", _cell(comments.get(key) or _meaning(place, key))) for key, value in _flat(node)]
+    rows = [(f"`{key}`", f"`{value}`", _cell(comments.get(key, ""))) for key, value in _flat(node)]
     yield from _table(("key", "value", "meaning"), rows)
 
 
@@ -94,19 +79,20 @@ def _comments(path: Path) -> dict[str, str]:
     return found
 
 
-def _recipe(path: Path) -> tuple[str, str, str]:
-    node, (group, name) = yaml.safe_load(path.read_text()) or {}, option_of(path)
-    if group in ("ablation", "experiment"):
-        node.pop(group, None)
+def _recipe(group: str, name: str) -> tuple[str, str, str]:
+    path = conf_dir() / group / f"{name}.yaml"
+    node = yaml.safe_load(path.read_text()) or {}
     sets = [*_begins_with(node), *(f"`{key}={value}`" for key, value in _flat(node))]
     return f"`{name}`", _cell(_head(path)), "<br>".join(sets)
 
 
 def _begins_with(node: dict[str, Any]) -> list[str]:
     """Takes the defaults list out of a file: its entries as one would write them on the command line."""
-    entries = [e if isinstance(e, dict) else {e: ""} for e in node.pop("defaults", []) if e != "_self_"]
+    entries = [
+        e if isinstance(e, dict) else {e: ""} for e in node.pop("defaults", []) if e not in ("_self_", "base_schema")
+    ]
     pairs = [pair for entry in entries for pair in entry.items()]
-    return [f"`{group.removeprefix('override ').lstrip('/')}{'=' * bool(name)}{name}`" for group, name in pairs]
+    return [f"`{group.removeprefix('override ').lstrip('/')}{f'={name}' if name else ''}`" for group, name in pairs]
 
 
 def _head(path: Path) -> str:
@@ -122,18 +108,6 @@ def _flat(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
         elif key not in ("_partial_", "_recursive_", "_convert_"):
             text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
             yield f"{prefix}{key}", _cell(text.removesuffix("...\n").strip())
-
-
-def _meaning(place: Place, key: str) -> str:
-    """What conf/ says of a key anywhere, else what the docstring of what is built says."""
-    *above, last = key.split(".")
-    for part in above:
-        place = place.children.get(part, Place())
-    said = place.children[last].comment if last in place.children else ""
-    for target in (t for t in place.targets if t.startswith("gausim.")):
-        found = pkgutil.resolve_name(target)
-        said = said or {**documented(found), **documented(found.__init__)}.get(last, "")
-    return said
 
 
 def _cell(text: str) -> str:

@@ -14,36 +14,26 @@ import hydra
 import pytest
 import torch
 import yaml
-from jsonschema import Draft7Validator
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from gausim.compose import config as _config
-from gausim.compose import root as _conf
-from gausim.compose.config import check_targets, compose, instantiate, run_hydra
-from gausim.compose.places import more_settings, option_of, read_places
-from gausim.compose.root import conf_dir
-from gausim.compose.schema import training_schema
+from gausim.compose.command import run_dir, run_hydra
+from gausim.compose.config import compose, instantiate
+from gausim.compose.root import conf_dir, folder_name, options
+from gausim.compose.targets import check_targets
 from gausim.core.errors import ConfigError
-from gausim.training.ranks.launch import Crew
-from gausim.training.ranks.layout import Layout, LocalRanks, RanksStrategy
-from gausim.training.trainer import make_trainer
+from gausim.runs.comparison import flatten
+from gausim.training.plan import DataFacts
 
-FILES = sorted(
-    path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml") if path.parent.name != "base"
-)
-# Searches of one method each, which are composed with the values that they try.
-OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
-# They set keys of other groups or of Hydra, and so build nothing of their own under their name.
-NOT_BUILT = ("hydra", "paths")
-# They change other groups under `@package _global_`: everything is built with them.
-GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol")
+GROUPS = sorted(path.name for path in conf_dir().iterdir() if path.is_dir() and path.name != "hydra")
+OPTIONS = [f"{group}={name}" for group in GROUPS for name in options(group)]
+TABLES = [name for name in options("experiment") if name.startswith("tables/")]
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
-def compose_option(option: str) -> DictConfig:
-    group, name = option_of(conf_dir() / f"{option}.yaml")
-    overrides = [f"{group}={name}"]
-    return compose("train", [*overrides, *(["model=gausim"] if group == "ablation" else [])])
+def leaves(config: DictConfig) -> dict[str, Any]:
+    """The settings of a configuration; what is built there aside."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    return {key: value for key, value in flatten(plain) if key.rpartition(".")[2] not in SPECIAL}
 
 
 def targets(node: Any) -> Iterator[DictConfig]:
@@ -64,52 +54,13 @@ def signature_of(node: DictConfig) -> tuple[inspect.Signature, dict[str, Any]]:
 
 
 def is_complete(node: DictConfig) -> bool:
-    """Whether the file alone can build the object; otherwise code injects the missing arguments."""
+    """Whether the node alone can build the object; otherwise code injects the missing arguments."""
     signature, arguments = signature_of(node)
     try:
         signature.bind(*node.get("_args_", []), **arguments)
     except TypeError:
         return False
     return True
-
-
-def needs_other_hardware(config: DictConfig) -> bool:
-    accelerator = str(OmegaConf.select(config, "trainer.accelerator", default="cpu"))
-    return accelerator not in ("cpu", "auto") and not torch.cuda.is_available()
-
-
-@pytest.fixture(scope="module")
-def schema() -> Draft7Validator:
-    return Draft7Validator(training_schema())
-
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_option_composes_fits_the_signatures_and_builds(
-    option: str, schema: Draft7Validator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WANDB_MODE", "disabled")
-    config, group = compose_option(option), option.split("/")[0]
-    check_targets(config)
-    for node in targets(config):
-        signature, arguments = signature_of(node)
-        signature.bind_partial(*node.get("_args_", []), **arguments)  # TypeError: a key that the target does not take
-    assert list(schema.iter_errors(OmegaConf.to_container(config, resolve=True))) == []
-    if group == "experiment":  # it wins over the root file
-        written = OmegaConf.load(conf_dir() / f"{option}.yaml")
-        assert all(config[key] == written[key] for key in {"name", "seed"} & set(written))
-    if group in NOT_BUILT:
-        return
-    if needs_other_hardware(config):
-        pytest.skip(f"{option} asks for trainer.accelerator={config.trainer.accelerator}, which this machine lacks")
-    if group == "trainer" and config.trainer.get("devices", 1) > 1:
-        crew = Crew(Layout(config.trainer.devices, accelerator="cpu"))
-        crew.environment = LocalRanks(0, config.trainer.devices, port=1)  # as if the others had started
-        made = make_trainer(instantiate(config.trainer, accelerator="cpu"), epochs=1, crew=crew)
-        assert made.world_size == config.trainer.devices and isinstance(made.strategy, RanksStrategy)
-        return
-    for node in config.values() if group in GLOBAL or group not in config else [config[group]]:
-        build(node)
 
 
 def build(node: Any) -> None:
@@ -124,110 +75,205 @@ def build(node: Any) -> None:
         build(child)
 
 
-def test_settings_that_no_configuration_lists_are_the_constructors_defaults() -> None:
-    root = read_places()
-    for key, value in more_settings().items():
-        *parents, name = key.split(".")
-        place = functools.reduce(lambda node, part: node.children[part], parents, root)
-        takers = [inspect.signature(hydra.utils.get_object(target)).parameters for target in place.targets]
-        defaults = [parameters[name].default for parameters in takers if name in parameters]
-        assert defaults and all((list(d) if isinstance(d, tuple) else d) == value for d in defaults), key
+@pytest.mark.parametrize("option", OPTIONS)
+def test_option_composes_fits_the_signatures_and_builds(option: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    config = compose([option])
+    check_targets(config)
+    for node in targets(config):
+        signature, arguments = signature_of(node)
+        signature.bind_partial(*node.get("_args_", []), **arguments)  # TypeError: a key that the target does not take
+    if option == "render=gsplat" and not torch.cuda.is_available():
+        pytest.skip("gsplat needs a GPU")
+    group = option.partition("=")[0]
+    for key in ("model", "loss", "optimizer", "plan") if group == "model" else [group]:
+        build(config.get(key))
 
 
-def test_settings_that_no_configuration_lists_are_set_like_others(capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(leaves(compose("train"))) <= 90
-    config = compose("train", ["trainer.progress=false", "loss.image.window=7", "trainer.overwrite=true"])
-    assert config.trainer.progress is False and config.loss.image.window == 7 and config.overwrite is True
-    assert "trainer.overwrite is called overwrite now" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match=r"model\.simulator\.network\.compile: unknown key"):
-        compose("train", ["model=spring_mass", "model.simulator.network.compile=true"])
+def test_the_chooser_is_small_and_every_setting_of_the_default_model_is_visible() -> None:
+    assert len(GROUPS) <= 10 and len(list(conf_dir().rglob("*.yaml"))) <= 70
+    assert len(leaves(compose())) <= 75
 
 
-def sweep_of(path: Path) -> dict[str, list[str]]:
-    """The values of every key that a file sweeps over."""
-    node = yaml.safe_load((conf_dir() / path.with_suffix(".yaml")).read_text())
-    params = node["hydra"]["sweeper"]["params"]
+# Other values of settings whose default does not tell their kind, or that take some texts only.
+OTHER: dict[str, Any] = {
+    "data.names": ["a"], "data.part": "test", "data.root": "elsewhere",
+    "data.scene": "a.ply", "data.selections": {"pinned": "low"}, "data.sequences": 3, "data.test.seeds": [1],
+    "model.simulator.hierarchy.edges": "union", "model.simulator.network.norm": "joint",
+    "data.law": "springs",
+    "model.simulator.hierarchy.levels": [{"diameter": 0.3, "edge_length": 1.0}],
+    "plan.schedule": "halving", "plan.clock": "cpu", "trainer.accelerator": "cpu", "plan.shared_from": 0.5,
+    "name": "other", "output_root": "elsewhere", "init_from": "run", "freeze": "network",
+    "ablation.name": "no_mass", "plan.t_start": 2,
+}  # fmt: skip
+
+
+def test_every_setting_of_the_default_model_can_be_set() -> None:
+    asked = {}
+    for key, value in leaves(compose()).items():
+        other = not value if isinstance(value, bool) else 7 if value is None else value
+        asked[key] = OTHER.get(key, other if isinstance(value, bool) or value is None else 2 * value or 0.25)
+        asked[key] = int(asked[key] or 3) if isinstance(value, int) and not isinstance(value, bool) else asked[key]
+    texts = [f"{key}={yaml.safe_dump(value, default_flow_style=True, width=10_000).split(chr(10))[0]}"
+             for key, value in asked.items()]  # fmt: skip
+    config = compose(texts)
+    found = OmegaConf.to_container(config, resolve=True)
+    for key, value in asked.items():
+        assert functools.reduce(dict.__getitem__, key.split("."), found) == value, key
+    for key in ("data", "model", "loss", "optimizer", "plan", "supervision", "render", "trainer"):
+        build(config[key])
+
+
+def test_defaults_of_constructors_are_those_of_the_default_configuration() -> None:
+    config = compose()
+    for section in ("model", "loss", "optimizer", "plan", "trainer"):
+        for node in targets(config[section]):
+            if not node._target_.startswith("gausim."):
+                continue
+            for name, parameter in signature_of(node)[0].parameters.items():
+                value = OmegaConf.to_container(node).get(name, parameter.default)
+                if parameter.default is not parameter.empty and not isinstance(value, dict):
+                    default = list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+                    assert default == value, (node._target_, name)
+
+
+def test_the_paper_is_one_word() -> None:
+    config = compose(["model=gausim_paper"])
+    simulator = config.model.simulator
+    assert (simulator.network.hidden, simulator.network.layers, simulator.network.norm) == (128, 16, "joint")
+    assert simulator.hierarchy.max_neighbours == 16 and simulator.hierarchy.edges == "union"
+    assert simulator.features.velocities and not simulator.features.rest_inputs and simulator.features.attributes == 4
+    assert simulator.template is None and simulator.head.lever == 0 and simulator.rollout.energy_guard_frames == 0
+    assert config.model.initial_states._target_.endswith(".FreeInitialStates")
+    loss = config.loss
+    assert (loss.image.balance, loss.backprop_steps, loss.rest_image_weight, loss.energy.probability) == (0.9, 1, 1, 0)
+    rates = {config.optimizer[name] for name in ("network_lr", "scene_lr", "initial_lr")}
+    assert rates == {4 * 2e-4} and config.plan.batch_size == 4  # one sequence on each of four GPUs
+    assert config.optimizer.optimizer._target_ == "torch.optim.Adam"
+    plan = instantiate(config.plan).resolved(DataFacts(sequences=30, frames=16, can_warm_start=True))
+    assert (plan.epochs, plan.repeats, plan.t_max, plan.warm_start) == (25, 70, 15, None)
+    assert [plan.steps(epoch) for epoch in (0, 1, 13, 14, 24)] == [1, 2, 14, 15, 15]
+    factors = [plan.rate_factor("network", epoch / 25) for epoch in (0, 15.9, 16, 18, 24)]
+    assert factors == [1, 1, 0.5, 0.25, 0.5**5]
+
+
+CHOICES = [
+    ("model=gausim_paper", ("model", "loss", "optimizer", "plan")), ("data=bunny", ("data",)),
+    ("trainer=ddp", ("trainer",)), ("supervision=tracks", ("supervision",)), ("render=reference", ("render",)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", options("experiment"))
+def test_an_experiment_never_undoes_the_command_line(name: str) -> None:
+    for choice, sections in CHOICES:
+        chosen, plain = compose([f"experiment={name}", choice]), compose([choice])
+        assert all(chosen[section] == plain[section] for section in sections), choice
+    words = [f"experiment={name}", "model=gausim_paper", "plan.epochs=3", "seed=5", "name=mine", "evaluate=false"]
+    config = compose(words)
+    assert (config.plan.epochs, config.seed, config.name, config.evaluate) == (3, 5, "mine", False)
+
+
+def sweep_of(name: str) -> dict[str, list[str]]:
+    """The values of every key that an experiment sweeps over."""
+    params = compose([f"experiment={name}"], with_hydra=True).hydra.sweeper.params
     return {key: re.findall(r"\[[^]]*\]|[^,]+", str(value)) for key, value in params.items()}
 
 
-TABLES = [path for path in FILES if path.parts[:2] == ("experiment", "tables")]
-
-
-@pytest.mark.parametrize("path", TABLES, ids=[path.name for path in TABLES])
-def test_jobs_of_a_table_compose(path: Path) -> None:
-    params = sweep_of(path)
-    config = compose("train", [f"experiment=tables/{path.name}", *(f"{key}={v[-1]}" for key, v in params.items())])
+@pytest.mark.parametrize("name", TABLES)
+def test_jobs_of_a_table_compose(name: str) -> None:
+    params = sweep_of(name)
+    config = compose([f"experiment={name}", *(f"{key}={values[-1]}" for key, values in params.items())])
     assert config.evaluate is True
     for key, values in params.items():
-        known = OmegaConf.select(config, key) if "." in key or key == "seed" else None
-        assert known is None or known == yaml.safe_load(values[-1]), key
+        if key not in GROUPS:
+            assert OmegaConf.select(config, key) == yaml.safe_load(values[-1]), key
 
 
-def test_a_comparison_is_at_strength_on_sealed_data(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_comparison_is_on_sealed_data_with_equal_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GAUSIM_SYNTHETIC_TEST", raising=False)
-    config = compose("train", ["experiment=tables/comparison", "method=physdreamer", "protocol=bunny_test"])
-    assert config.model.method.discretisation.filling.dense == 1.0 and config.model.method.discretisation.cells == 32
-    assert config.data.sequences == config.data.test.sequences == ["seq_008", "seq_009", "seq_010", "seq_011"]
-    assert config.protocol.part == "test" and config.plan.max_minutes == 10
-    config = compose("train", ["method=gausim_paper", "protocol=pudding_soft_test", "budget=gpu"])
-    assert config.plan.repeats == 70 and config.loss.backprop_steps == 1 and config.data.names == ["pudding_soft"]
-    assert config.data.test.seeds == list(range(101, 121)) and str(config.data.root).endswith("synthetic_test")
-
-
-def leaves(node: Any) -> list[Any]:
-    """Settings below a node; what is built there aside."""
-    if isinstance(node, DictConfig):
-        return [leaf for key in node if key not in SPECIAL for leaf in leaves(node._get_node(key))]
-    return [node]
+    for data in sweep_of("tables/comparison")["data"]:
+        config = compose(["experiment=tables/comparison", "model=physdreamer", f"data={data}"])
+        assert config.data.part == "test" and config.trials == 4 and config.plan.max_minutes == 10
+    config = compose(["data=test/pudding_soft"])
+    assert str(config.data.root).endswith("synthetic_test") and list(config.data.names) == ["pudding_soft"]
+    assert list(config.data.test.seeds) == list(range(101, 121))
 
 
 @pytest.mark.parametrize(
     "swept",
-    [
-        ["plan.max_minutes=1,2", "ablation=none,no_mass"],
-        ["data.root=a/b,a/../b,a_b"],
-        ["experiment=bunny,bunny_paper", "name=rose"],
-    ],
+    [["plan.max_minutes=1,2", "ablation=none,no_mass"], ["data.root=a/b,a/../b,a_b"], ["data=bunny,synthetic"]],
 )
 def test_jobs_of_a_sweep_never_share_a_directory(
     swept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[Path] = []
-    arguments = ["-m", *swept, "paths.output_root=o", *(() if swept[-1].startswith("name") else ("name=rose",))]
-    run_hydra("train", lambda config: seen.append(_config.run_dir()), arguments)
-    assert len(seen) == math.prod(len(override.split(",")) for override in swept)
-    assert len(set(seen)) == len(seen)
+    run_hydra(lambda config: seen.append(run_dir()), ["-m", *swept, "output_root=o"])
+    assert len(set(seen)) == len(seen) == math.prod(len(override.split(",")) for override in swept)
     for path in seen:
         inside = path.resolve().relative_to(tmp_path / "o")
-        assert inside.name.startswith("seed_")
+        assert inside.name.startswith("seed_") and (inside.parts[0] == "sweep") == (swept[0].startswith("data="))
         assert not re.search(r"(name|seed|ablation|model|output_root)=", str(inside))  # said by the path already
 
 
 def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[tuple[str, str]] = []
-    swept = ["-m", "ablation=none,[no_mass,no_momentum],[no_momentum,no_mass]", "model=gausim"]
-    run_hydra("train", lambda config: seen.append((config.ablation.name, _config.run_dir().parts[-3])), swept)
-    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum", "no_momentum+no_mass")]
+    swept = ["-m", "ablation=none,[no_mass,no_momentum]", "model=gausim"]
+    run_hydra(lambda config: seen.append((config.ablation.name, run_dir().parts[-3])), swept)
+    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum")]
 
 
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
-    assert _conf.folder_name("") == "" and _conf.folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
-    texts = ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]
-    names = [_conf.folder_name(text) for text in texts]
+    assert folder_name("") == "" and folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
+    names = [folder_name(text) for text in ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]]
     assert len(set(names)) == len(names)
     assert all("/" not in name and len(name) <= 120 for name in names)
 
 
+def test_a_directory_is_a_data_set_and_names_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my objects" / "vase").mkdir(parents=True)
+    seen: list[tuple[str, str]] = []
+    run_hydra(lambda config: seen.append((config.data.root, config.name)), ["data=my objects/vase"])
+    assert seen == [(str(tmp_path / "my objects" / "vase"), "vase")]
+    assert (tmp_path / "outputs" / "vase" / "seed_0").is_dir()
+
+
+def test_the_configurations_of_all_jobs_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    run_hydra(lambda config: None, ["-m", "ablation=none,no_mass", "seed=0,1", "--cfg", "job"])
+    found = list(yaml.safe_load_all(capsys.readouterr().out))
+    assert [(one["model"]["simulator"]["conserve_mass"], one["seed"]) for one in found] == [
+        (True, 0), (True, 1), (False, 0), (False, 1),
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("override", "key", "meant"),
-    [("modle=gausim", "modle", "model"), ("sed=1", "sed", "seed"), ("plan.epoch=3", "plan.epoch", None)],
-)
-def test_unknown_keys_are_named_with_what_was_meant(override: str, key: str, meant: str | None) -> None:
-    with pytest.raises(ConfigError, match=key) as caught:
-        compose("train", [override])
-    assert meant is None or f"Did you mean {meant}" in str(caught.value)
+    ("words", "message"),
+    [
+        ("modle=gausim", "modle: unknown key. Did you mean 'model'?"),
+        ("trainer.thread=2", "trainer.thread: unknown key. Did you mean 'trainer.threads'?"),
+        ("model=gausm", "model=gausm: unknown choice. Did you mean 'gausim'?"),
+        ("data=syntetic", "data=syntetic: neither a directory nor a name of conf/data. Did you mean 'synthetic'?"),
+        ("seed=x", "seed: Value 'x' of type 'str' could not be converted to Integer."),
+        ("experiment=tables/joint", "experiment=tables/joint: is several trainings, so add -m."),
+        ("ablation=no_mass model=static",
+         "ablation=no_mass: does not fit this model, which has no key model.simulator.conserve_mass."),
+        ("ablation=joint",
+         "ablation=joint: changes nothing of this configuration, so it would repeat ablation=none."),
+    ],
+)  # fmt: skip
+def test_a_wrong_command_is_one_sentence_and_leaves_nothing(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for arguments in (words.split(), ["-m", *words.split(), "name=sweep"]):
+        if "several" in message and "-m" in arguments:
+            continue
+        with pytest.raises(ConfigError) as caught:
+            run_hydra(lambda config: None, arguments)
+        assert str(caught.value) == message
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

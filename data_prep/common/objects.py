@@ -40,7 +40,7 @@ def described(facts: Mapping[str, Any], stills: int, sequences: Mapping[str, int
 
 def train_command(name: str, out: Path) -> str:
     """The command that trains on an object."""
-    return f"gausim train data=object data.root={out} name={name}"
+    return f"gausim train data={out} name={name}"
 
 
 def refuse_faults(work: Path, out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,8 @@ class GridSweeper(BasicSweeper):
         """Stores the settings, documented in conf/hydra/sweeper/grid.yaml."""
         super().__init__(max_batch_size, params)
 
-    def _parse_config(self) -> list[str]:
-        from gausim.compose.places import spelled
-
-        return spelled(super()._parse_config())
+    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
+        """Does nothing: all jobs were checked before the sweep (:func:`gausim.compose.command.run_hydra`)."""
 
     def sweep(self, arguments: list[str]) -> None:
         """Trains all combinations of the overrides and prints a summary of the jobs.

@@ -33,7 +33,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pu
     own = {name.removeprefix("model."): value for name, value in found.items() if name.startswith("model.")}
     second = ("log_density.1", "attributes.1", "template.scenes.1")
     assert set(own) == {name for name in source if not name.startswith(second)}
-    assert all(torch.equal(value, source[name]) for name, value in own.items())  # averaged, statistics included
+    assert all(torch.equal(value, source[name]) for name, value in own.items())  # statistics included
     states = [value for name, value in found.items() if name.startswith("initial_states.velocity")]
     assert len(states) == 2 and all(bool(value.any()) for value in states)
     run = load_run(out)

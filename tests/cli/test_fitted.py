@@ -20,7 +20,7 @@ from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
     "plan.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
-    "render=reference", "callbacks.panels.every_epochs=0", "name=toy", "doctor=false",
+    "render=reference", "trainer.panel_epochs=0", "name=toy", "doctor=false",
 )  # fmt: skip
 STAGES = "model.plan.stages"
 SMALL: dict[str, list[str]] = {
@@ -108,7 +108,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
         pytest.importorskip("warp")
     from gausim.training.callbacks.resume import RunCheckpoint
 
-    asked = [f"model={model}", *SMALL[model], *arguments, "callbacks.checkpoint.every_steps=1"]
+    asked = [f"model={model}", *SMALL[model], *arguments, "trainer.checkpoint_steps=1"]
     train.main([*asked, "name=whole"])
     saved, calls = RunCheckpoint.on_train_batch_end, []
 

@@ -20,7 +20,7 @@ NETWORK = "model.predictor.network."
 
 
 def tune(root: Path, source: Path, out: Path, *arguments: str) -> dict[str, Tensor]:
-    asked = ["experiment=finetune", f"data.root={root}", f"init_from={source}", f"hydra.run.dir={out}/seed_0"]
+    asked = ["data=object", f"data.root={root}", f"init_from={source}", f"hydra.run.dir={out}/seed_0"]
     assert command.main([*asked, *TINY, "evaluate=false", *arguments]) == 0
     return weights(out / "seed_0")
 
@@ -31,8 +31,8 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
         ("toy", 24.0, 2, 2), ("other", 50.0, 3, 2),
     ]  # fmt: skip
     simulator, states = run.module.model, run.module.initial_states
-    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 4), (63, 4)]
-    assert simulator.fps == (24.0, 50.0) and len(simulator.template.scenes) == 2
+    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 8), (63, 8)]
+    assert simulator.fps == (24.0, 50.0) and len(simulator.template.bodies) == 2
     assert len(list(states.parameters())) == 5 and states.scene_of_sequence == (0, 0, 1, 1, 1)
     for own in (*simulator.log_density, *simulator.attributes, *states.parameters()):
         assert bool(own.detach().any())  # each has learned
@@ -91,7 +91,7 @@ def test_other_models_hand_on_their_network_too(model: str, toy: Path, other: Pa
 def test_other_settings_than_those_of_the_network_are_named(joint: Path, other: Path, tmp_path: Path, capsys) -> None:
     tune(other, joint, tmp_path / "alike")
     assert "other values of" not in capsys.readouterr().out
-    tune(other, joint, tmp_path / "centred", "model.simulator.features.centred=true")
+    tune(other, joint, tmp_path / "centred", "model.simulator.features.centred=false")
     assert "was trained with other values of model.simulator.features.centred\n" in capsys.readouterr().out
 
 
@@ -111,7 +111,7 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path,
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (["experiment=finetune"], r"init_from: name the trained run.*init_from=RUN"),
+        (["experiment=pretrain_fit", "data=object"], r"init_from: name the trained run.*init_from=RUN"),
         (["freeze=network"], r"freeze: a network at random.*init_from=RUN"),
         (["init_from=nowhere"], r"nowhere/last\.ckpt: no such checkpoint"),
         (["data.names=[]"], r"data\.names: \[\] asked for, the roots hold \['toy', 'other'\]"),

@@ -28,7 +28,7 @@ RESERVED = "data.test={sequences: [seq_001]}"
 TINY = (
     "model=constant_velocity", "model.method.anchors=12", "model.plan.stages.velocity.iterations=2",
     "model.plan.round=1", "plan.t_max=7", "trainer.progress=false", "trainer.threads=1", "render=reference",
-    "callbacks.panels.every_epochs=1", "callbacks.motion.every_epochs=1", "logger=none", "name=toy", RESERVED,
+    "trainer.panel_epochs=1", "trainer.motion_epochs=1", "logger=none", "name=toy", "data=object", RESERVED,
 )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def trained(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamesp
     folder = tmp_path_factory.mktemp("protocol")
     with pytest.MonkeyPatch.context() as patch:
         spy = Spy(patch)
-        assert train.main([f"data.root={toy}", f"paths.output_root={folder}", *TINY]) == 0
+        assert train.main([f"data.root={toy}", f"output_root={folder}", *TINY]) == 0
     return SimpleNamespace(run=folder / "toy" / "seed_0", spy=spy)
 
 
@@ -125,7 +125,7 @@ def test_looks_are_declared_counted_and_said(
     found = json.loads((run / "evaluation" / "metrics.json").read_text())
     assert found["objects"]["toy"]["sequences"] == ["seq_000"] and found["run"]["part"] == "development"
     assert not (run / "evaluation" / "test.json").exists()
-    with pytest.raises(ConfigError, match=r"--test: expected the number of trials.*--trials N.*protocol\.trials"):
+    with pytest.raises(ConfigError, match=r"--test: expected the number of trials.*--trials N.*trials=N"):
         evaluate.main([str(run), "--test"])
     with monkeypatch.context() as patch, pytest.raises(ConfigError, match="pip install flip-evaluator"):
         patch.setattr(image, "find_spec", lambda name: None)
@@ -191,10 +191,10 @@ def test_data_without_a_test_part_know_no_look(toy: Path, run: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "trials", "reserved", "message"),
     [
-        ("exam", None, "seq_001", r"protocol\.part: expected null, development or test, got 'exam'"),
-        ("test", None, "seq_001", r"protocol\.part: expected protocol\.trials .* got None, .* got 1 of 2"),
-        ("test", 8, "", r"got 0 of 2"),
-        (None, None, "all", r"evaluate: every sequence of the data belongs to the test part\. Set protocol\.part=test"),
+        ("exam", None, "seq_001", r"data\.part: expected null, development or test, got 'exam'"),
+        ("test", None, "seq_001", r"trials: expected the number of trials made on the development part .* got None"),
+        ("test", 8, "", r"sequences of any name asked for, it has 0 of the test part"),
+        (None, None, "all", r"evaluate: all sequences of the data belong to the test part\. Set data\.part=test"),
         ("test", 8, "seq_001", ""),
         ("development", None, "seq_001", ""),
     ],
@@ -203,10 +203,10 @@ def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(
     part: str | None, trials: int | None, reserved: str, message: str, toy: Path
 ) -> None:
     names: Any = "all" if reserved == "all" else [name for name in [reserved] if name]
-    data = ReadyDataModule(toy, test={"sequences": names})
-    cfg = OmegaConf.create({"protocol": {"part": part, "trials": trials}, "evaluate": True})
+    data = ReadyDataModule(toy, part=part, test={"sequences": names})
+    cfg = OmegaConf.create({"data": {"part": part}, "trials": trials, "evaluate": True})
     if not message:
         check_protocol(cfg, data)
         return
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises((ConfigError, DataError), match=message):
         check_protocol(cfg, data)

@@ -44,7 +44,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
     # Another process trains the second; the first is a run of another configuration, unharmed by being refused.
     (second / "FINISHED").unlink()
     config = (first / "config.yaml").read_text()
-    (first / "config.yaml").write_text(config.replace("max_epochs: 2", "max_epochs: 3"))
+    (first / "config.yaml").write_text(config.replace("epochs: 2", "epochs: 3"))
     with sole_writer(second / ".lock"):
         status, output = do("cut", "seed=0,1")
     assert status == 2 and f"left out, {second}: another process" in output, output
@@ -53,22 +53,28 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
 
 
 @pytest.mark.slow
-def test_a_job_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Sweeps, tmp_path: Path) -> None:
+def test_a_job_that_fails_before_its_first_step_stops_no_other_and_leaves_nothing(do: Sweeps, tmp_path: Path) -> None:
     late = tmp_path / "late"
     swept = (f"data.root={late},{do.folder}/toy", "seed=0")
     status, output = do("mixed", *swept)
     assert status == 2 and "sweep of 2 jobs: 1 trained, 1 failed" in output, output
-    failed, trained = sorted(runs_of(do, "mixed"), key=lambda run: (run / "FINISHED").exists())
-    last = (failed / "FAILED").read_text().splitlines()[-1]
-    assert last.startswith("DataError: ") and str(late) in last and f"{failed}: {last}" in output
-    assert "Traceback" not in output
+    assert f"DataError: {late}" in output and "Traceback" not in output
+    assert [steps(run) for run in runs_of(do, "mixed")] == [8]
     write_toy_object(late, frames=8)
     status, output = do("mixed", *swept)
-    assert status == 2 and "1 finished before, 1 failed" in output and "left out, failed before" in output, output
-    assert history(failed) == ["started", "failed"]
-    status, output = do("mixed", *swept, "sweep.retry_failed=true")
     assert status == 0 and "1 trained, 1 finished before" in output, output
-    assert steps(failed) == steps(trained) == 8 and history(failed)[2:] == ["started", "finished"]
+    assert [steps(run) for run in runs_of(do, "mixed")] == [8, 8]
+
+
+@pytest.mark.slow
+def test_a_job_that_failed_later_is_tried_again_on_demand(do: Sweeps) -> None:
+    assert do("later", "seed=0", **dying(SAVED, 2))[0] == -9
+    (run,) = runs_of(do, "later")
+    (run / "FAILED").write_text("ValueError: no\n")
+    status, output = do("later", "seed=0")
+    assert status == 2 and "left out, failed before" in output, output
+    status, output = do("later", "seed=0", "retry_failed=true")
+    assert status == 0 and "1 trained" in output and steps(run) == 8, output
 
 
 @pytest.mark.parametrize(
@@ -134,7 +140,7 @@ def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Sweeps) -
     deaths = [(STEP, moments.randint(60, 100)), (SAVED, moments.randint(5, 40)), (FINISH, 1),
               (STEP, moments.randint(60, 100)), ("os.replace", moments.randint(20, 80))]  # fmt: skip
     for target, count in deaths:
-        every = f"callbacks.checkpoint.every_steps={moments.choice((1, 3, 7))}"
+        every = f"trainer.checkpoint_steps={moments.choice((1, 3, 7))}"
         status, output = do("disturbed", *swept, every, **dying(target, count))
         assert status == -9, f"ended by itself ({status}) before {target} was called {count} times\n{output}"
         told.update(line for line in output.splitlines() if line.startswith("run: "))

@@ -16,8 +16,8 @@ from gausim.cli import train as command
 from gausim.training.callbacks import panels
 from gausim.training.module import GausSimModule
 
-TINY = [word for word in PAPER if not word.startswith(("callbacks.panels", "logger"))]
-SHOWN = "callbacks.panels.every_epochs=1"
+TINY = [word for word in PAPER if not word.startswith(("trainer.panel_epochs", "logger"))]
+SHOWN = "trainer.panel_epochs=1"
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(
     monkeypatch.setattr(GausSimModule, "training_step", careless_step)
     monkeypatch.setattr(panels, "_clip", careless_clip)
     command.main([*arguments, SHOWN])
-    command.main([*arguments, "name=hidden", "logger=none", "callbacks.panels=null"])
+    command.main([*arguments, "name=hidden", "logger=none", "trainer.panel_epochs=0"])
     run = Path("outputs/toy/seed_0")
     hidden = weights(Path("outputs/hidden/seed_0"))
     assert all(torch.equal(value, hidden[name]) for name, value in weights(run).items())

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from helpers.joint_runs import PAPER, weights
 from helpers.shared import Shared
 from helpers.simulators import LEVELS
@@ -39,7 +38,7 @@ def finished(toy: Path, shared: Shared) -> Path:
     """A run of one epoch, which tests copy."""
 
     def train(root: Path) -> None:
-        assert command.main([f"data.root={toy}", *PAPER, "plan.epochs=1", f"paths.output_root={root}"]) == 0
+        assert command.main([f"data.root={toy}", *PAPER, "plan.epochs=1", f"output_root={root}"]) == 0
 
     return shared("finished", train)
 
@@ -54,8 +53,8 @@ def again(arguments: list[str], finished: Path, tmp_path: Path) -> list[str]:
 def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shown = ["callbacks.motion.every_epochs=1", "logger=default", "doctor=true", "callbacks.panels.every_epochs=1"]
-    assert command.main([*[x for x in arguments if x not in ("logger=none", "callbacks.panels=null")], *shown]) == 0
+    shown = ["trainer.motion_epochs=1", "logger=default", "doctor=true", "trainer.panel_epochs=1"]
+    assert command.main([*[x for x in arguments if x not in ("logger=none", "trainer.panel_epochs=0")], *shown]) == 0
     made = {"config.yaml", "FINISHED", "last.ckpt", "epochs.csv", "motion.csv", "panels", "tensorboard", "csv"}
     assert made <= {p.name for p in RUN.iterdir()}
     assert [(r["epoch"], float(r["steps"])) for r in rows(RUN / "epochs.csv")] == [("1", 1.0), ("2", 2.0)]
@@ -70,7 +69,7 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     loaded = load_run(RUN)
     assert not loaded.module.training and loaded.objects[0].name == "toy"
 
-    assert command.main([*arguments, "name=alone", "callbacks.motion=null"]) == 0
+    assert command.main([*arguments, "name=alone", "trainer.motion_epochs=0"]) == 0
     assert "WARNING" not in capsys.readouterr().out and not Path("outputs/alone/seed_0/motion.csv").exists()
     alone = weights(Path("outputs/alone/seed_0"))
     assert all(torch.equal(value, alone[name]) for name, value in weights(RUN).items())
@@ -106,21 +105,8 @@ def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> N
 
 def test_a_changed_config_is_refused_by_the_name_of_its_keys(again: list[str]) -> None:
     (RUN / "FINISHED").unlink()
-    with pytest.raises(RunError, match=r"changed: loss\.image\.window, loss\.static_weight\."):
-        command.main([*again, "loss.static_weight=2", "loss.image.window=7"])
-
-
-def test_a_run_of_a_version_with_other_settings_goes_on(again: list[str]) -> None:
-    """Its configuration said what is left to defaults now, and had other names."""
-    old = yaml.safe_load((RUN / "config.yaml").read_text())
-    assert old["loss"]["explosion"] == 3.0 and old["trainer"]["clock"] == "wall"  # though no configuration lists them
-    del old["loss"]["explosion"], old["overwrite"]
-    old |= {"supervision": {}, "experiment": {"name": "toy"}, "ablation": {"name": "none"}}
-    old["trainer"]["overwrite"] = False
-    (RUN / "config.yaml").write_text(yaml.safe_dump(old))
-    (RUN / "FINISHED").unlink()
-    assert command.main(again) == 0
-    assert load_run(RUN).config["trainer"].get("overwrite") is None
+    with pytest.raises(RunError, match=r"changed: loss\.image\.balance, loss\.static_weight\."):
+        command.main([*again, "loss.static_weight=2", "loss.image.balance=0.7"])
 
 
 def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str], capsys) -> None:
@@ -132,8 +118,8 @@ def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str],
 
 
 def test_a_sweep_by_a_single_training_is_refused(arguments: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"ablations is several trainings\. Add -m"):
-        command.main([*arguments, "sweep=ablations"])
+    with pytest.raises(ConfigError, match=r"experiment=tables/ablations: is several trainings, so add -m"):
+        command.main([*arguments, "experiment=tables/ablations"])
 
 
 @pytest.mark.usefixtures("again")

@@ -227,7 +227,7 @@ def test_scene_without_a_pinned_kernel_says_how_to_pin_one(spoilt: Path) -> None
     with pytest.raises(SceneError, match=r"no kernel is pinned.*gausim inspect SCENE --pin") as caught:
         ObjectData(spoilt).scene()
     override = re.findall(r"'(data\.selections=.*)'", str(caught.value))
-    config = compose("train", [*override, f"data.root={spoilt}"])  # the override that is proposed, as it is
+    config = compose([*override, f"data.root={spoilt}"])  # the override that is proposed, as it is
     assert ObjectData(spoilt, selections=config.data.selections).scene().pinned.any()
 
 

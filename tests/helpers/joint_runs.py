@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gausim.core import Cameras
-from gausim.runs.checkpoint import averaged_weights, read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 from helpers import toy_object
 from helpers.plain import plain_scene
 from helpers.simulators import SMALLEST
@@ -47,5 +47,5 @@ def both(toy: Path, other: Path) -> str:
 
 
 def weights(run: Path) -> dict[str, Tensor]:
-    """What a run has learned; averaged, where it averages."""
-    return averaged_weights(read_checkpoint(run / "last.ckpt"))
+    """What a run has learned."""
+    return dict(read_checkpoint(run / "last.ckpt")["state_dict"])

@@ -70,7 +70,7 @@ def train(options: dict[str, Any]) -> dict[str, Any]:
     """Optimiser steps on the union of ``count`` sequences: gradients of the last one, weights, numbers."""
     ranks, dtype = Ranks(), getattr(torch, options.get("dtype", "float32"))
     objective = Objective(**options.get("objective", {}))
-    module = real_module(objective, dtype, OptimizerSettings(clip_norm=1.0, ema_decay=0.5))
+    module = real_module(objective, dtype, OptimizerSettings(clip_norm=1.0))
     with torch.no_grad():
         for parameter in module.simulator.parameter_groups()["network"]:
             parameter.mul_(options.get("wild", 1.0))
@@ -89,7 +89,6 @@ def train(options: dict[str, Any]) -> dict[str, Any]:
         "grads": {n: None if p.grad is None else p.grad.double().flatten().tolist() for n, p in named.items()},
         "statistics": {n: b.double().flatten().tolist() for n, b in module.named_buffers() if "normaliser" in n},
         "weights": digest(dict(module.state_dict())),
-        "average": digest(module.average.state_dict()),
         "baselines": sorted(module.baselines.state_dict()),
     }
 

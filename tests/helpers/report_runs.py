@@ -32,7 +32,7 @@ CONFIG: dict[str, Any] = {
     "experiment": {"name": "toy"},
     "seed": 0,
     "name": "toy",
-    "paths": {"output_root": "out"},
+    "output_root": "out",
 }
 
 

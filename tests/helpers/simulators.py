@@ -37,7 +37,7 @@ LEVELS = "model.simulator.hierarchy.levels=[{diameter: 0.7, edge_length: 2.0},{d
 # The smallest run of `gausim train`, in silence.
 SMALLEST = (
     "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "trainer.progress=false",
-    "trainer.threads=1", "callbacks.panels=null", "plan.warm_start=null", "doctor=false",
+    "trainer.threads=1", "trainer.panel_epochs=0", "plan.warm_start=null", "doctor=false",
 )  # fmt: skip
 
 

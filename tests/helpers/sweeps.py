@@ -25,7 +25,7 @@ class Sweeps:
         self._toy = write_toy_object(folder / "toy", frames=8).root
 
     def __call__(self, name: str, *overrides: str, **death: Any) -> tuple[int, str]:
-        given = (f"data.root={self._toy}", f"paths.output_root={self.folder}", f"name={name}")
+        given = (f"data.root={self._toy}", f"output_root={self.folder}", f"name={name}")
         return self._server.order(["-m", *TINY, *given, *overrides], **death)
 
 

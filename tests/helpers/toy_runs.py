@@ -21,7 +21,7 @@ from helpers.simulators import SMALLEST
 # The smallest run in which everything happens that a resumed run could get wrong.
 TINY = (
     *SMALLEST, "model=gausim_paper", "plan.repeats=2", "plan.t_max=3", "plan.t_start=1",
-    "plan.batch_size=1", "render=reference", "optimizer.ema_decay=0.9", "trainer.log_every_n_steps=1",
+    "plan.batch_size=1", "render=reference", "trainer.log_every_n_steps=1",
 )  # fmt: skip
 
 
@@ -71,7 +71,7 @@ class Trainings(Server):
         super().__init__()
         self._shared = shared
         self.folder = shared("toy_runs", Path.mkdir)
-        self.given = (f"data.root={shared('toy_of_three', _write_toy)}", f"paths.output_root={self.folder}", *TINY)
+        self.given = (f"data.root={shared('toy_of_three', _write_toy)}", f"output_root={self.folder}", *TINY)
 
     def moving(self, kind: str) -> str:
         """An override: the object as a free body that falls onto a floor, or in a hand that moves."""

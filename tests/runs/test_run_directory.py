@@ -13,8 +13,9 @@ from gausim.runs.directory import RunDirectory
 CONFIG = {
     "seed": 0,
     "loss": {"balance": 0.9},
-    "trainer": {"max_epochs": 3, "threads": 1},
-    "paths": {"output_root": "o"},
+    "trainer": {"threads": 1},
+    "plan": {"epochs": 3},
+    "output_root": "o",
 }
 
 
@@ -29,14 +30,14 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
 
 
 def test_changed_keys_are_named_and_free_ones_are_not(tmp_path: Path) -> None:
-    changed = {**CONFIG, "seed": 1, "paths": {"output_root": "p"}, "trainer": {"max_epochs": 4, "threads": 2}}
-    assert changed_keys(CONFIG, changed) == ["seed", "plan.epochs"]
+    changed = {**CONFIG, "seed": 1, "output_root": "p", "trainer": {"threads": 2}, "plan": {"epochs": 4}}
+    assert changed_keys(CONFIG, changed) == ["plan.epochs", "seed"]
     assert changed_keys(CONFIG, {**CONFIG, "extra": 1}) == ["extra"]
     run = RunDirectory(tmp_path)
     run.prepare(CONFIG)
     run.prepare(changed)  # nothing was learned yet
     run.checkpoint.write_bytes(b"x")
-    with pytest.raises(RunError, match=r"changed: seed, trainer\.max_epochs\."):
+    with pytest.raises(RunError, match=r"changed: plan\.epochs, seed\."):
         run.prepare(CONFIG)
 
 

@@ -36,7 +36,7 @@ def distance(found: dict[str, Any], expected: dict[str, Any]) -> float:
 
 def assert_as_one(found: list[Any], alone: Any, tolerance: float, rounding: float = 1e-4) -> None:
     assert all(isinstance(answer, dict) for answer in (*found, alone)), (found, alone)
-    for name in ("weights", "average", "stats", "statistics", "baselines"):
+    for name in ("weights", "stats", "statistics", "baselines"):
         assert all(rank[name] == found[0][name] for rank in found), f"{name} differ between ranks"
     assert distance(found[0]["grads"], alone["grads"]) <= tolerance
     assert distance(found[0]["statistics"], alone["statistics"]) <= tolerance

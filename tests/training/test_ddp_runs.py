@@ -29,7 +29,7 @@ def whole(trainings: Trainings) -> Path:
 def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_the_same_bits(
     trainings: Trainings, whole: Path
 ) -> None:
-    settings = (*TWO, "plan.epochs=3", "callbacks.checkpoint.every_steps=2")
+    settings = (*TWO, "plan.epochs=3", "trainer.checkpoint_steps=2")
     began = time.monotonic()
     status, output = trainings("rank_cut", *settings, **killed(STEP, 6, rank=1))
     assert status == 2, output
@@ -76,7 +76,7 @@ def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(trainings: Traini
 def test_ranks_that_a_scheduler_has_started_meet_and_train(trainings: Trainings, whole: Path, tmp_path: Path) -> None:
     """Two processes with SLURM's variables, as srun and submitit start them."""
     config = yaml.safe_load((whole / "config.yaml").read_text())
-    config["paths"]["output_root"], config["name"] = str(tmp_path), "scheduled"
+    config["output_root"], config["name"] = str(tmp_path), "scheduled"
     (tmp_path / "given").mkdir()
     (tmp_path / "given" / "config.yaml").write_text(yaml.safe_dump(config))
     run = tmp_path / "scheduled" / "seed_0"

@@ -13,9 +13,9 @@ from helpers.corpus import FRAMES, SEQUENCES, write_corpus
 from msgspec.structs import replace
 
 from gausim.cli import evaluate, report, simulate, train
-from gausim.compose.bare import EvenMaterial, open_scene
 from gausim.compose.build import build
 from gausim.compose.config import compose
+from gausim.compose.unfilmed import EvenMaterial, open_scene
 from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.data.pretraining import CorpusDataModule
@@ -46,7 +46,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def pretraining(corpus: Path, *choice: str) -> tuple[GausSimModule, CorpusDataModule]:
     choice = choice or ("experiment=pretrain",)
-    return build(compose("train", [*choice, f"data.root={corpus}", *SMALL]))
+    return build(compose([*choice, f"data.root={corpus}", *SMALL]))
 
 
 def test_rollouts_begin_at_true_states_of_any_frame_and_spare_the_bodies_held_out(corpus: Path) -> None:

@@ -23,9 +23,9 @@ def step_of(run: Path, name: str = "last.ckpt") -> int:
 
 def test_a_run_killed_while_it_saves_equals_an_uninterrupted_one(trainings: Trainings, toy_run: Path) -> None:
     kept = read_checkpoint(toy_run / "last.ckpt")["gausim"]
-    assert {"average", "epoch", "baselines"} < set(kept) and all(kept["epoch"]["sums"].values())
+    assert {"epoch", "baselines"} < set(kept) and all(kept["epoch"]["sums"].values())
     assert step_of(toy_run) == 18
-    run, settings = trainings.run("cut"), (*THREE, "callbacks.checkpoint.every_steps=4")
+    run, settings = trainings.run("cut"), (*THREE, "trainer.checkpoint_steps=4")
     # Between naming the predecessor and the successor of the checkpoint at the end of the second epoch.
     assert trainings("cut", *settings, **killed("os.replace", 4, match=".last.ckpt."))[0] == -9
     assert step_of(run) == step_of(run, "last.previous.ckpt") == 10
@@ -43,7 +43,7 @@ def test_a_run_killed_again_and_again_equals_an_uninterrupted_one(trainings: Tra
     run = trainings.run("often")
 
     def go(**death: Any) -> tuple[int, str]:
-        return trainings("often", *THREE, "callbacks.checkpoint.every_steps=4", **death)
+        return trainings("often", *THREE, "trainer.checkpoint_steps=4", **death)
 
     # In the second step, before anything was saved: what the loggers hold is dropped.
     assert go(**killed(STEP, 2))[0] == -9
@@ -72,7 +72,7 @@ def test_a_run_killed_again_and_again_equals_an_uninterrupted_one(trainings: Tra
 def test_a_moving_body_killed_again_and_again_equals_an_uninterrupted_one(trainings: Trainings, kind: str) -> None:
     template = "model.simulator.template"
     settings = (*THREE, "model=gausim", trainings.moving(kind), f"{template}.modes=6", f"{template}.solid.spacing=0.3",
-                "callbacks.checkpoint.every_steps=2")  # fmt: skip
+                "trainer.checkpoint_steps=2")  # fmt: skip
     whole, run = trainings.whole(f"whole_{kind}", *settings), trainings.run(kind)
     for deaths, death in enumerate((killed(STEP, 2), killed(SAVED, 2), killed(STEP, 3, when="after"), killed(STEP, 4))):
         status, output = trainings(kind, *settings, **death)
@@ -108,7 +108,7 @@ def test_a_run_whose_time_was_up_is_not_trained_further(trainings: Trainings) ->
 
 
 def test_a_directory_that_cannot_be_written_is_named(trainings: Trainings) -> None:
-    status, output = trainings("denied", "paths.output_root=/sys/gausim")  # not even by the superuser
+    status, output = trainings("denied", "output_root=/sys/gausim")  # not even by the superuser
     assert status == 2 and output.strip().splitlines()[-1].startswith("error: /sys/gausim"), output
     assert "Traceback" not in output
 
@@ -120,7 +120,7 @@ def test_twenty_kills_at_random_moments(trainings: Trainings) -> None:
     moments, kills, steps, seen, patience = random.Random(0), 0, set(), 0, 0.6
     run, status, output = trainings.run("disturbed"), -9, ""
     while kills < 20:
-        every = f"callbacks.checkpoint.every_steps={moments.choice((1, 3, 7))}"
+        every = f"trainer.checkpoint_steps={moments.choice((1, 3, 7))}"
         death = {"kill_after": patience * moments.uniform(0.5, 1.5)}
         status, output = trainings("disturbed", *settings, every, **death)
         assert status in (-9, 0), output

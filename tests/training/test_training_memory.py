@@ -135,7 +135,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
 
     _, module = pair(Objective(backprop_steps=backprop_steps), 0.01)
     module.images.renderer = blobs
-    module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
+    module.settings = OptimizerSettings(optimizer=torch.optim.SGD)  # Adam counts steps on the host
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
     module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and baselines are read once
     draws = torch.Generator().manual_seed(1)

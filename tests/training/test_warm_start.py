@@ -18,7 +18,7 @@ from gausim.training import modal_fit
 from gausim.training.optimizers import OptimizerSettings
 
 QUICK = [x for x in SMALLEST if "warm_start" not in x] + [
-    "model.simulator.template.modes=6", "render=cpu", "logger=none", "callbacks.motion=null", "evaluate=false",
+    "model.simulator.template.modes=6", "render=cpu", "logger=none", "trainer.motion_epochs=0", "evaluate=false",
     "plan.t_max=4", "plan.repeats=1", "plan.batch_size=1",
 ]  # fmt: skip
 
@@ -45,8 +45,8 @@ def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_check
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gausim.training.module.GausSimModule.on_train_epoch_end", _interrupt)
         with pytest.raises(RuntimeError, match="cut"):
-            train.main([*common, "plan.epochs=2", "callbacks.checkpoint.every_steps=1", cut])
-    assert train.main([*common, "plan.epochs=2", "callbacks.checkpoint.every_steps=1", cut]) == 0
+            train.main([*common, "plan.epochs=2", "trainer.checkpoint_steps=1", cut])
+    assert train.main([*common, "plan.epochs=2", "trainer.checkpoint_steps=1", cut]) == 0
     assert "warm start" not in capsys.readouterr().out.split("resuming")[1]
     whole, again = (read_checkpoint(tmp_path / n / "last.ckpt")["state_dict"] for n in ("whole", "cut"))
     assert all(torch.equal(value, again[name]) for name, value in whole.items())
@@ -58,7 +58,7 @@ def _interrupt(module: object) -> None:
 
 def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: Path) -> None:
     torch.manual_seed(0)
-    module, _ = build(compose("train", [f"data.root={toy}", "model=gausim", *QUICK]))
+    module, _ = build(compose([f"data.root={toy}", "model=gausim", *QUICK]))
     model, draws = module.model, torch.Generator().manual_seed(3)
     start = 0.1 * torch.randn(2, 6, generator=draws)
     attributes = model.attributes[0].detach().clone()

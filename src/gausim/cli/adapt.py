@@ -80,6 +80,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "masks": None,
         "selections": None,
         "test": None,
+        "part": None,
         "sequences": arguments.sequences,
     }
     plan = config["plan"] | {
@@ -112,14 +113,12 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
 
 
 def _checked(overrides: Sequence[str]) -> list[str]:
-    from gausim.compose.places import spelled
-
     for text in overrides:
         if "=" not in text.lstrip("="):
             raise ConfigError(
                 f"--set {text}: expected KEY=VALUE, e.g. trainer.threads=1. `gausim adapt --help` explains."
             )
-    return [override.lstrip("+") for override in spelled(overrides)]
+    return list(overrides)
 
 
 def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:

@@ -109,7 +109,7 @@ def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options:
     Raises:
         ConfigError: a number is not positive.
     """
-    from gausim.compose.bare import EvenMaterial, open_scene
+    from gausim.compose.unfilmed import EvenMaterial, open_scene
 
     given = {"stiffness": arguments.stiffness, "damping": arguments.damping}
     material = {name: value for name, value in given.items() if value is not None}

@@ -29,7 +29,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--cameras", default="all", choices=("all", "train", "heldout"), help="measure in these (default: all)")
     add("--test", action="store_true", help="look at the test part of the data; counted in evaluation/test.json")
     add("--trials", type=positive, metavar="N", help="with --test: declare N trials of the method on the development "
-        "part (default: protocol.trials of the run)")  # fmt: skip
+        "part (default: trials of the run)")  # fmt: skip
     add("--flip", action="store_true", help="also measure FLIP (extra `flip`), in as much time as all other metrics")
     add_data_option(parser)
     add("--out", metavar="DIR", type=Path, help="write to this folder (default: RUN/evaluation, of a part "

@@ -182,11 +182,11 @@ def _look(
     run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str, list[str]], state: dict[str, Any]
 ) -> dict[str, Any]:
     """Records a look at the test part; returns what the summary says of it."""
-    trials = arguments.trials or (run.config.get("protocol") or {}).get("trials")
+    trials = arguments.trials or run.config.get("trials")
     if not trials:
         raise ConfigError(
             "--test: expected the number of trials that were made of the method on the development part. Declare it "
-            "with --trials N, or train with protocol.trials=N."
+            "with --trials N, or train with trials=N."
         )
     path, folder = run.run_dir / TEST, run.run_dir / "evaluation"
     if not path.is_file() and (folder / "metrics.json").is_file():  # an earlier evaluation of the development part

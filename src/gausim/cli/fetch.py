@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
         shutil.move(folder, target)
     is_run = (target / CONFIG).is_file()
     print(f"fetched: {target}")
-    print(f"next: gausim {f'evaluate {target} --data DIR' if is_run else f'train data=object data.root={target}'}")
+    print(f"next: gausim {f'evaluate {target} --data DIR' if is_run else f'train data={target}'}")
     return 0
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Limit of sentences on the terminal; the page or table covers all objects.
 MOST_SENTENCES = 3
 PUSH = "--force on=tip weights=3 direction=x"
-OWN_OBJECT = ("train", "data=object", "data.root=ROOT", "name=mine")
+OWN_OBJECT = ("train", "data=DIRECTORY")
 
 
 def bars(*columns: ProgressColumn) -> Progress:

@@ -13,8 +13,8 @@ USAGE = """usage: gausim train [KEY=VALUE ...] [-m] [--cfg job] [--info] [--reso
 Learns an object's dynamics from multi-view videos. Every setting is a key of conf/train.yaml and its groups:
 
   gausim train                                  the embedded synthetic set, the default model
-  gausim train experiment=bunny seed=1          a prepared experiment
-  gausim train data=object data.root=PATH       an object of your own
+  gausim train data=DIRECTORY                   an object of your own
+  gausim train model=gausim_paper               the paper: network, loss, optimiser and plan
   gausim train ablation=no_momentum             without the momentum loss
   gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true     a sweep: all combinations
   gausim train -m seed=0,1,2,3 hydra/launcher=joblib                 several jobs at a time (also submitit_slurm)
@@ -22,9 +22,9 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train trainer=ddp trainer.devices=4 plan.batch_size=8
   gausim train --cfg job                        print the whole configuration, run nothing
 
-A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
-checkpoint; once finished it is refused, unless overwrite=true. A sweep (-m) that is started again leaves out
-what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
+A run goes to OUTPUT_ROOT/NAME/seed_SEED (output_root, name, seed; the name is by default that of the data). Started
+again, it resumes from its last checkpoint; once finished it is refused, unless overwrite=true. A sweep (-m) that is
+started again leaves out what is finished, resumes what is not, and tries again what failed if retry_failed=true."""
 
 
 def train(cfg: DictConfig) -> float | None:
@@ -39,11 +39,11 @@ def main(argv: Sequence[str]) -> int:
     if any(a in ("-h", "--help") for a in argv):
         print(USAGE)
         return 0
-    from gausim.compose.config import run_hydra
+    from gausim.compose.command import run_hydra
     from gausim.runs.files import unwritable
 
     try:
-        return run_hydra("train", train, argv)
+        return run_hydra(train, argv)
     except OSError as error:  # Hydra makes the run directory before it calls the task
         explained = unwritable(error)
         if explained is None:

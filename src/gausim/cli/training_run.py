@@ -16,16 +16,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli.output import end
 from gausim.cli.sweeps.jobs import do_job
-from gausim.compose.build import build, load_run, with_resolved_plan
-from gausim.compose.config import instantiate, run_dir
-from gausim.compose.root import chosen, in_sweep
+from gausim.compose.build import CORPUS, build, load_run, with_resolved_plan
+from gausim.compose.command import run_dir
+from gausim.compose.config import instantiate
+from gausim.compose.root import in_sweep
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.pretraining import CorpusDataModule
 from gausim.doctor.examine import examine
 from gausim.doctor.page import findings_text
 from gausim.models.step.simulator import GausSim
-from gausim.results.looks import DEVELOPMENT, TEST_PART
+from gausim.results.looks import TEST_PART
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import EPOCHS
 from gausim.training.first_frames import begin_free_bodies
@@ -39,6 +40,12 @@ from gausim.training.transfer import load_shared, load_simulator, unlike
 
 # Largest first displacement per frame observed for small pushes [diagonals].
 FIRST_STEP = 0.065
+
+# Folders of loggers within the run.
+FOLDERS: dict[str, dict[str, str]] = {
+    "tensorboard": {"name": "tensorboard", "version": ""},
+    "csv": {"name": "csv"},
+}
 
 COMPARED = {
     "ImageSupervision": "the images (supervision=images)",
@@ -58,19 +65,18 @@ def train(cfg: DictConfig) -> float | None:
     run = RunDirectory(run_dir())
     if in_sweep():
         return do_job(cfg, run, train_run)
-    if (sweep := chosen("sweep")) != "none":
-        raise ConfigError(f"sweep: {sweep} is several trainings. Add -m: gausim train -m sweep={sweep} ...")
     with run.writing():
         return train_run(cfg, run)
 
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     """Trains into a run directory locked by this process, and evaluates the run if configured."""
-    cfg = with_resolved_plan(cfg)
-    if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(_plain(cfg)):
-        objective = run.facts()["last_epoch"].get("excess_static")
-    else:
-        objective = _train(cfg, run)
+    with run.leaving_no_trace(Path(cfg.output_root)):
+        cfg = with_resolved_plan(cfg)
+        if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(_plain(cfg)):
+            objective = run.facts()["last_epoch"].get("excess_static")
+        else:
+            objective = _train(cfg, run)
     if cfg.evaluate:
         _evaluate(run)
     return objective
@@ -85,7 +91,7 @@ def _evaluate(run: RunDirectory) -> None:
     """`gausim evaluate RUN` in a separate process, so that it measures time and memory of predictions alone."""
     if getattr(rank_zero_only, "rank", 0):
         return
-    part = (run.config().get("protocol") or {}).get("part")
+    part = run.config()["data"].get("part")
     command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path), *["--test"] * (part == "test")]
     status = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}).returncode
     if status:
@@ -118,6 +124,10 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
     check_protocol(cfg, datamodule)
+    if "joint" in str(cfg.ablation.name).split("+") and len(datamodule.objects) == 1:
+        raise ConfigError(
+            f"ablation=joint: expected several objects, the data have {datamodule.objects[0].name} alone."
+        )
     _take_over(cfg, module, resumed=resumed)
     if module.initial_states is not None:
         begin_free_bodies(module, datamodule)
@@ -128,22 +138,20 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
 
 def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
     """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
-    part, trials = cfg.protocol.part, cfg.protocol.trials
-    if part not in (None, DEVELOPMENT, TEST_PART):
-        raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
+    part, trials = cfg.data.get("part"), cfg.trials
     if not cfg.evaluate or not datamodule.has_videos:
         return
     names = [(item.test_part, record.name) for item in datamodule.objects for record in item.sequences]
     reserved = [name in part_of for part_of, name in names]
-    if part == TEST_PART and (not trials or not any(reserved)):
+    if part == TEST_PART and not trials:
         raise ConfigError(
-            f"protocol.part: expected protocol.trials for a look at the test part, got {trials}, and sequences of a "
-            f"test part in the data, got {sum(reserved)} of {len(reserved)}."
+            f"trials: expected the number of trials made on the development part for a look at the test part "
+            f"(data.part=test), got {trials}."
         )
     if part != TEST_PART and all(reserved):
         raise ConfigError(
-            "evaluate: every sequence of the data belongs to the test part. Set protocol.part=test and "
-            "protocol.trials=N (trials made on the development part), or evaluate=false."
+            "evaluate: all sequences of the data belong to the test part. Set data.part=test and trials=N (N made "
+            "on the development part), or evaluate=false."
         )
 
 
@@ -160,7 +168,10 @@ def _fit(
         _introduce(trainer, module, datamodule, run, resumed=resume is not None)
         if cfg.doctor and not in_sweep():
             faults = _warn_of_data(datamodule)
-    trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
+    try:
+        trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
+    finally:
+        run.has_stepped = module.global_step > 0
     if plan is not None and not plan.order:  # no trained stage, so no epoch has saved a checkpoint
         trainer.save_checkpoint(run.checkpoint, weights_only=False)
     if trainer.interrupted:
@@ -265,12 +276,11 @@ def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> N
 
 def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int) -> Trainer:
     """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run."""
-    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node]
-    wanted = (cfg.logger or {}).values() if crew.is_first else ()
-    loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    return make_trainer(
-        instantiate(cfg.trainer), epochs=epochs, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew
-    )
+    settings = instantiate(cfg.trainer)
+    callbacks = settings.callbacks(has_videos=cfg.data._target_ != CORPUS)
+    wanted = (cfg.logger or {}).items() if crew.is_first else ()
+    loggers = [instantiate(n, save_dir=str(run.path), **FOLDERS.get(str(k), {})) for k, n in wanted if n]
+    return make_trainer(settings, epochs=epochs, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
 
 
 def _introduce(

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.compose.config import instantiate
-from gausim.compose.data_paths import located
+from gausim.compose.data_paths import absolute, located
 from gausim.compose.device import find_device
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
@@ -33,13 +33,15 @@ from gausim.training.plan import DataFacts, TrainingPlan
 from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources
 
+CORPUS = "gausim.data.pretraining.CorpusDataModule"
+
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
     """A trained run, loaded for evaluation or simulation."""
 
     config: dict[str, Any]  # the resolved configuration
-    module: GausSimModule  # the module in evaluation mode, with the run's weights (averaged ones if there are any)
+    module: GausSimModule  # the module in evaluation mode, with the run's weights
     objects: list[ObjectData]  # the objects; their index is the ``scene_id`` of the module's scenes
     datamodule: ReadyDataModule  # the data
     renderer: Renderer  # the renderer of the training, or the one that fits the device
@@ -72,7 +74,7 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         datamodule.plan = StagedCurriculum(plan, course.t_max or 1, course.batch_size or 1)
     scenes = [item.scene() for item in datamodule.objects]
     given = {"scenes": scenes, "fps": [item.fps for item in datamodule.objects]}
-    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    renderer, objective = instantiate(config.render), instantiate(config.loss) if config.get("loss") else Objective()
     if plan is None:
         model = instantiate(config.model.simulator, **given)()
         method: SharedSimulator | StagedFit = _shared_simulator(config, model, datamodule)
@@ -98,7 +100,7 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
 
 def open_data(config: DictConfig, *, sealed: bool = True) -> ReadyDataModule:
     """The data module of a configuration; ``sealed`` is that of :func:`build`."""
-    datamodule: ReadyDataModule = instantiate(config.data)
+    datamodule: ReadyDataModule = instantiate(config.data, seed=int(config.seed))
     datamodule.sealed = sealed
     return datamodule
 
@@ -128,14 +130,16 @@ def _can_warm_start(config: DictConfig, datamodule: ReadyDataModule) -> bool:
 
 
 def with_resolved_plan(config: DictConfig) -> DictConfig:
-    """A training configuration that states what its plan leaves to the data.
+    """A training configuration that states what its plan leaves to the data, and absolute paths.
 
     Raises:
         GausSimError: the data are missing or damaged, or the plan does not fit them.
     """
-    plan, found = resolved_plan(config, open_data(config)), copy.deepcopy(config)
+    datamodule, found = open_data(config), copy.deepcopy(config)
+    plan = resolved_plan(config, datamodule)
     OmegaConf.set_struct(found, False)
     found.plan = {**found.plan, **plan.settings()}
+    found.data = absolute(cast("dict[str, Any]", OmegaConf.to_container(config.data, resolve=True)))
     if "method" in config.model:
         found.plan.repeats = plan.repeats
     OmegaConf.set_struct(found, True)
@@ -172,7 +176,7 @@ def load_run(
     if is_pretrained(directory.path):
         raise ConfigError(
             f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
-            f"it: `gausim train experiment=finetune model=gausim init_from={directory.path} data.root=OBJECT`."
+            f"it: `gausim train data=OBJECT init_from={directory.path}`."
         )
     config, module, datamodule = _load(directory, checkpoint, data)
     # A renderer of the other kind of device gives way to the one that fits.
@@ -185,7 +189,7 @@ def load_run(
 def is_pretrained(run_dir: Path | str) -> bool:
     """Whether a run was trained on, or fitted to, bodies of a corpus."""
     target = RunDirectory(run_dir).config().get("data", {}).get("_target_")
-    return bool(target == "gausim.data.pretraining.CorpusDataModule")
+    return bool(target == CORPUS)
 
 
 def load_corpus_run(

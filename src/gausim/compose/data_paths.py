@@ -58,6 +58,13 @@ def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) ->
     return merged
 
 
+def absolute(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A data configuration, or an entry of its list ``root``, with absolute paths."""
+    placed = {key: str(Path(data[key]).resolve()) for key in _FILES if data.get(key)}
+    entries = [absolute(e) if isinstance(e, Mapping) else e and str(Path(e).resolve()) for e in listed(data["root"])]
+    return {**data, **placed, "root": entries if isinstance(data["root"], list) else entries[0]}
+
+
 def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
     """Scenes and masks outside the data set that a data configuration names, including masks beside their scene.
 

@@ -1,4 +1,4 @@
-"""Setup of Hydra before composition: directory of conf/, schema of the root keys, and resolvers.
+"""Setup of Hydra before composition: directory of conf/ and its files, schema of the root keys, and resolvers.
 
 This module does not load torch, so that shell completion is fast.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,32 +21,8 @@ from omegaconf import MISSING, OmegaConf
 import gausim
 from gausim.core.errors import ConfigError
 
-HYDRA_VERSION_BASE = "1.3"
+HYDRA_VERSION_BASE, ROOT_FILE = "1.3", "train"
 LONGEST_FOLDER_NAME = 120
-
-
-@dataclass
-class SweepConfig:
-    """Handling of existing runs by the jobs of a sweep.
-
-    Attributes:
-        retry_failed: resume runs that ended with an error; otherwise they are skipped.
-    """
-
-    retry_failed: bool = False
-
-
-@dataclass
-class ProtocolConfig:
-    """Evaluation after training on data with a test part.
-
-    Attributes:
-        part: part that `evaluate=true` measures: `development` or `test`; null: data without a test part.
-        trials: trials that were made of the method on the development part, declared in every table of the test part.
-    """
-
-    part: str | None = None
-    trials: int | None = None
 
 
 @dataclass
@@ -54,60 +30,62 @@ class RootConfig:
     """Schema of the root keys of a training configuration: a misspelt root key is an error.
 
     Attributes:
-        data: the data module: which set, views and frames.
-        plan: the training plan: epochs, predicted frames, batches, learning-rate schedule, warm start and end.
+        data: the data module: which set, views, frames and batches.
         model: the dynamics.
-        supervision: reference of the predictions: images by default, or points or motion tracks.
-        loss: the terms and their weights.
-        optimizer: the optimiser (partial, without its parameters) and its rates.
+        loss: the terms and their weights; null for a method that is fitted in stages.
+        optimizer: the optimiser and its rates; null for a method that is fitted in stages.
+        plan: epochs, predicted frames, schedule, warm start and end.
+        supervision: reference of the predictions: images, true points or motion tracks.
         render: the renderer.
-        trainer: arguments of the Lightning trainer.
+        trainer: devices, threads, checkpoints and display.
         logger: loggers by name.
-        callbacks: callbacks by name.
-        paths: directory to which runs are written.
         ablation: record of the chosen ablation.
-        experiment: record of the chosen experiment.
-        sweep: handling of existing runs by the jobs of a sweep.
-        protocol: evaluation after training on data with a test part.
         seed: seed of every random generator.
+        name: name of the run, by default that of the data; its directory is `${output_root}/${name}/seed_${seed}`.
+        output_root: directory of all runs; a relative path starts at the directory of the command.
         init_from: run from which the network and its input statistics are copied; null: random initialisation.
         freeze: `network` freezes that network, so that only parameters of scenes are trained; `model` copies the whole
             simulator of that run and freezes it, so that only initial states are trained.
         doctor: whether the findings of `gausim doctor` are printed before training (not in sweeps).
         evaluate: whether the run is evaluated after training (`gausim evaluate`), for reports.
+        trials: trials that were made of the method on the development part, declared in every table of the test part.
         overwrite: remove an existing run in the directory.
-        name: name of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
-        task_name: name of the task, for logs and dashboards.
+        retry_failed: in a sweep, resume runs that ended with an error; otherwise they are skipped.
     """
 
     data: Any = MISSING
-    plan: Any = MISSING
     model: Any = MISSING
+    loss: Any = None
+    optimizer: Any = None
+    plan: Any = MISSING
     supervision: Any = None
-    loss: Any = MISSING
-    optimizer: Any = MISSING
     render: Any = MISSING
     trainer: Any = MISSING
     logger: Any = None
-    callbacks: Any = None
-    paths: Any = MISSING
     ablation: Any = None
-    experiment: Any = None
-    sweep: SweepConfig = field(default_factory=SweepConfig)
-    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     seed: int = 0
+    name: str = MISSING
+    output_root: str = "outputs"
     init_from: str | None = None
     freeze: str | None = None
     doctor: bool = True
     evaluate: bool = False
+    trials: int | None = None
     overwrite: bool = False
-    name: str = MISSING
-    task_name: str = "train"
+    retry_failed: bool = False
 
 
-def folder_name(text: str) -> str:
-    """Returns a directory name for a text: the text itself if valid, else a short form with a hash."""
-    text = re.sub(r"(^|,)\+\+", r"\1", text)
+def folder_name(text: str, name: str = "") -> str:
+    """Returns a directory name for a text: the text itself if valid, else a short form with a hash.
+
+    Overrides `data=object,data.root=DIRECTORY` of a job become the directory's last part, if ``name`` is another.
+    """
+    parts = [part for part in text.split(",") if part != "data=object"]
+    roots = [part for part in parts if part.startswith("data.root=")]
+    if len(parts) < len(text.split(",")) and len(roots) == 1:
+        path = roots[0].partition("=")[2].strip("'")
+        short = f"{Path(path).name}-{hashlib.sha256(path.encode()).hexdigest()[:6]}"
+        text = ",".join([*([] if Path(path).name == name else [short]), *(part for part in parts if part not in roots)])
     plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
     if plain == text and len(text) <= LONGEST_FOLDER_NAME:
         return text
@@ -144,6 +122,14 @@ def chosen(group: str) -> str:
     return str(choice or "none")
 
 
+def data_name(*, _root_: Any) -> str:
+    """Returns the default name of a run: the name of its data, of a directory that of the directory."""
+    choice, root = chosen("data"), OmegaConf.select(_root_, "data.root")
+    if choice in ("none", "object") and isinstance(root, str):
+        return Path(root).resolve().name
+    return choice.replace("/", "_")
+
+
 def job_group(name: str) -> str:
     """Returns the group of a run on dashboards, NAME/ABLATION/MODEL, common to its seeds and settings."""
     return "/".join([name, chosen("ablation"), chosen("model")]) if HydraConfig.initialized() else name
@@ -156,7 +142,7 @@ def job_name(seed: int) -> str:
 
 
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
-for resolver in (chosen, folder_name, job_threads, job_group, job_name):
+for resolver in (chosen, data_name, folder_name, job_threads, job_group, job_name):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 
@@ -175,3 +161,9 @@ def conf_dir() -> Path:
         f"expected the configurations in {candidates[0]} or {candidates[1]}, found neither. Reinstall gausim, or run "
         "from a complete checkout."
     )
+
+
+def options(group: str, *more: Path) -> list[str]:
+    """Returns the names of the files of a group in conf/, and in further directories like it: `tables/comparison`."""
+    folders = [root / group for root in (conf_dir(), *more)]
+    return sorted({path.relative_to(f).with_suffix("").as_posix() for f in folders for path in f.rglob("*.yaml")})

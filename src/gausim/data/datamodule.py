@@ -38,12 +38,13 @@ class ReadyDataModule(LightningDataModule):
         scene: str | Path | None = None,
         masks: str | Path | None = None,
         selections: Mapping[str, Selection | str] | None = None,
-        law: str = "solid",
         plan: Shows | None = None,
         seed: int = 0,
         prefetch: int = 0,
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
+        law: str | None = None,
+        part: str | None = None,
         test: Mapping[str, Any] | None = None,
     ) -> None:
         """Stores the settings; files are first read by :attr:`objects` or :meth:`setup`.
@@ -54,12 +55,13 @@ class ReadyDataModule(LightningDataModule):
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
-            law: of large deformations: ``solid``, or ``springs`` for a net of springs.
             plan: the resolved training plan, or its part that data follow.
             seed: seed of the training order.
             prefetch: number of batches that a process of its own reads ahead; 0 reads each when it is asked for.
             names: names of the objects to use; all when None.
             sequences: number of sequences per object to use, or their names; all when None.
+            law: of large deformations, ``solid`` or ``springs``; None: that of ``dataset.json``, else ``solid``.
+            part: use only the sequences of the ``development`` or the ``test`` part; those of both when None.
             test: the test part of the objects (:class:`gausim.data.objects.ReservedPart`), in addition to what their
                 ``dataset.json`` declares.
         """
@@ -68,6 +70,7 @@ class ReadyDataModule(LightningDataModule):
         self._options: dict[str, Any] = {
             "scene": scene, "masks": masks, "selections": selections, "law": law, "test": test,
         }  # fmt: skip
+        self._part = part
         self.sealed = True
         self.plan, self._seed, self._prefetch = plan, seed, prefetch
         self._sampler: SequenceBatchSampler | None = None
@@ -122,7 +125,7 @@ class ReadyDataModule(LightningDataModule):
             cameras = item.sequences[0].cameras
             lines.append(
                 f"{item.name}: {len(item.sequences)} sequences, {len(item.train_views)} views of "
-                f"{cameras.width}x{cameras.height}, {item.fps:g} fps"
+                f"{cameras.width}x{cameras.height}, {item.fps:g} fps, {item.law}, {item.root}"
             )
             if 0 < first < item.train_frames.stop:
                 lines.append(
@@ -193,4 +196,4 @@ class ReadyDataModule(LightningDataModule):
         roots = find_objects(root)
         if len(roots) > 1 and any(options[key] is not None for key in ("scene", "masks")):
             raise ConfigError(f"data.root: 'scene' and 'masks' are of one object, but {root} holds {len(roots)}.")
-        return [ObjectData(r, sequences=self._sequences, sealed=self.sealed, **options) for r in roots]
+        return [ObjectData(r, sequences=self._sequences, part=self._part, sealed=self.sealed, **options) for r in roots]

@@ -22,6 +22,8 @@ from gausim.io.plain_json import checked, read_json
 from gausim.io.ply import MASK_NAMES, load_scene
 from gausim.ops.selection import Selection, apply_masks, parse_half_space, require_pinned
 
+PARTS = ("development", "test")
+
 
 class _Facts(Struct):
     fps: Annotated[float, Meta(gt=0)]
@@ -32,6 +34,7 @@ class _Facts(Struct):
     train_frames: tuple[Annotated[int, Meta(ge=0, le=0)], Annotated[int, Meta(ge=2, le=1 << 31)]]
     name: str = ""
     pinned_below_z: float | None = None
+    law: Literal["solid", "springs"] | None = None
 
 
 class ReservedPart(Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,10 +87,11 @@ class ObjectData:
         heldout_views: cameras never trained on.
         train_frames: the frames that training may see, e.g. range(0, 16).
         pinned_below_z: a reconstruction pins the kernels below this height [scene units]; None where not stated.
+        law: its law of large deformations (:class:`gausim.core.GaussianScene`).
         facts: all other entries of ``dataset.json``.
         surroundings: what acts on the body besides its own elasticity.
         scene_path, masks_path: files of the rest scene and its masks; without the second the one beside the PLY.
-        selections, law, test, sealed: as given.
+        selections, test, sealed: as given.
     """
 
     def __init__(
@@ -98,7 +102,8 @@ class ObjectData:
         scene: Path | str | None = None,
         masks: Path | str | None = None,
         selections: Mapping[str, Selection | str] | None = None,
-        law: str = "solid",
+        law: str | None = None,
+        part: str | None = None,
         test: Mapping[str, Any] | None = None,
         sealed: bool = False,
     ) -> None:
@@ -110,7 +115,8 @@ class ObjectData:
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
-            law: its law of large deformations (:class:`gausim.core.GaussianScene`).
+            law: its law; that of ``dataset.json`` when None, else ``solid``.
+            part: use only the sequences of the ``development`` or the ``test`` part; those of both when None.
             test: the test part, in addition to that of ``dataset.json`` (:class:`gausim.data.objects.ReservedPart`).
             sealed: refuse unseen frames and the true motion of the test part.
 
@@ -118,9 +124,8 @@ class ObjectData:
             ConfigError: the law is unknown.
             DataError: ``dataset.json`` is missing or has a wrong field.
         """
-        if law not in LAWS:
-            raise ConfigError(f"data.law is '{law}'; expected one of {', '.join(LAWS)}.")
-        self.law = law
+        if law not in (None, *LAWS):
+            raise ConfigError(f"data.law: expected null, {' or '.join(LAWS)}, got '{law}'.")
         self.root = Path(root)
         path = self.root / "dataset.json"
         self.facts = read_json(path)
@@ -129,10 +134,14 @@ class ObjectData:
         self.views, self.train_views, self.heldout_views = found.views, found.train_views, found.heldout_views
         self.train_frames, self.pinned_below_z = range(*found.train_frames), found.pinned_below_z
         self.surroundings, self._grip = read_surroundings(self.facts, str(path))
+        self.law: str = law or found.law or LAWS[0]
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
         self._chosen, self.selections, self.test, self.sealed = sequences, dict(selections or {}), test, sealed
+        if part not in (None, *PARTS):
+            raise ConfigError(f"data.part: expected null, {' or '.join(PARTS)}, got '{part}'.")
+        self._part = part
         declared = (reserved_part(self.facts.get("test"), f"{path}: test"), reserved_part(test, "data.test"))
         self._reserved = [part for part in declared if part is not None]
 
@@ -162,13 +171,16 @@ class ObjectData:
     def sequences(self) -> list[SequenceRecord]:
         """The object's sequences in the order of their names."""
         folder, found, wanted = self.root / "sequences", self.names, self._chosen
+        if self._part is not None:
+            found = [name for name in found if (name in self.test_part) == (self._part == "test")]
         if isinstance(wanted, int):
             chosen = found[:wanted] if 0 < wanted <= len(found) else []
         else:
             chosen = found if wanted is None else list(wanted)
         if not chosen or not set(chosen) <= set(found):
             asked = "of any name" if wanted is None else wanted
-            raise DataError(f"{folder}: sequences {asked} asked for, it has {len(found)}: {found}.")
+            of = f" of the {self._part} part" if self._part else ""
+            raise DataError(f"{folder}: sequences {asked} asked for, it has {len(found)}{of}: {found}.")
         records = [self.record(name) for name in chosen]
         for record in records:
             if record.count < self.train_frames.stop:

@@ -35,7 +35,7 @@ class ImageLoss(nn.Module):
 
     compares_alpha: bool = False
 
-    def __init__(self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS) -> None:
+    def __init__(self, *, balance: float = 0.5, window: int = 5, pixels: float = REFERENCE_PIXELS) -> None:
         """``balance`` is lambda in [0, 1], ``window`` the odd size of the SSIM window [pixels].
 
         Raises:

@@ -23,10 +23,10 @@ class EnergyLoss:
         probability: probability of this term in a batch.
     """
 
-    weight: float | None = 0.0
+    weight: float | None = None
     frames: int = 36
     stretch: int = 12
-    probability: float = 0.5
+    probability: float = 0.2
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
@@ -62,15 +62,15 @@ class Objective:
 
     image: ImageLoss = field(default_factory=ImageLoss)
     image_weight: float = 1.0
-    static_weight: float = 1.0
+    static_weight: float = 10.0
     rest_image_weight: float = 0.0
     static_probability: float | None = None
-    momentum_weight: float = 1.0
+    momentum_weight: float = 1.5e4
     over_steps: str = "mean"
-    backprop_steps: int = 1
+    backprop_steps: int = 0
     checkpoint_steps: bool = False
     energy: EnergyLoss = field(default_factory=EnergyLoss)
-    mixing_weight: float = 0.0
+    mixing_weight: float = 0.01
     explosion: float = 3.0
 
     def __post_init__(self) -> None:

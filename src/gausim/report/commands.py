@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable
 
 _TRAIN, _SWEEP = ["gausim", "train"], "-m"
-_ROOT, _DEFAULT_ROOT = "paths.output_root", "outputs"
+_ROOT, _DEFAULT_ROOT = "output_root", "outputs"
 _WITHOUT_EFFECT = (_ROOT, "trainer.progress", "trainer.threads")
 
 # Values of a command by key, in the order of its words; a word without "=" has none.

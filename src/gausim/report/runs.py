@@ -26,7 +26,7 @@ from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST
 _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys without an effect on the result, and those of seeds.
-_FREE = ("paths", "logger", "callbacks", "sweep", "protocol", "task_name", "evaluate", "seed", "data.seed", "trainer")
+_FREE = ("output_root", "logger", "trials", "retry_failed", "evaluate", "seed", "trainer")
 INIT_FROM, _SEED_FOLDER = "init_from", re.compile(r"seed_\d+/?$")
 _DIGITS = 12  # of hashes and commits
 _SWEEP = "multirun.yaml"  # Hydra's record of a sweep

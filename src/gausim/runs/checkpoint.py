@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,46 +149,13 @@ def scene_text(prints: Sequence[dict[str, Any]]) -> str:
     return "; ".join(texts)
 
 
-class WeightAverage:
-    """An exponential moving average of the parameters; off where the decay is 0."""
-
-    def __init__(self, decay: float) -> None:
-        """``decay`` per optimiser step; it starts smaller, so that initial weights are soon forgotten."""
-        self._decay, self._steps = decay, 0
-        self._values: dict[str, Tensor] = {}
-
-    @torch.no_grad()
-    def update(self, parameters: Iterable[tuple[str, nn.Parameter]]) -> None:
-        """Averages in the current parameters, by name."""
-        if self._decay == 0:
-            return
-        self._steps += 1
-        decay = min(self._decay, (1 + self._steps) / (10 + self._steps))
-        for name, parameter in parameters:
-            if name not in self._values:
-                self._values[name] = parameter.detach().clone()
-            else:
-                # A loaded average is on the CPU until its first update.
-                self._values[name] = self._values[name].to(parameter).lerp_(parameter.detach(), 1 - decay)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The averaged parameters by name (empty when off) and the number of steps."""
-        return {"steps": self._steps, "values": dict(self._values)}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from ``state``."""
-        self._steps = int(state["steps"])
-        self._values = dict(state["values"])
-
-
-def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The weights of a checkpoint by name; averaged weights take precedence."""
-    return {**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]}
-
-
 def load_weights(module: nn.Module, checkpoint: dict[str, Any]) -> None:
-    """Loads the weights of a checkpoint into a module of equal parameters; averaged weights take precedence."""
+    """Loads the weights of a checkpoint into a module of equal parameters.
+
+    Raises:
+        RunError: the parameters differ.
+    """
     try:
-        module.load_state_dict(averaged_weights(checkpoint))
+        module.load_state_dict(checkpoint["state_dict"])
     except RuntimeError as error:
         raise RunError(f"the checkpoint does not fit the model of its config: {error}") from error

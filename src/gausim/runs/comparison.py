@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-# Keys that may differ when a run is resumed: paths, display and hardware, which do not change the learned weights.
+# Keys that may differ when a run is resumed: paths, display and hardware, not the training.
 FREE_KEYS = (
-    "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "protocol", "task_name", "doctor", "evaluate",
-    "trainer.threads", "render.threads",
-    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
-    "trainer.log_every_n_steps", "trainer.progress", "overwrite",
+    "output_root", "logger", "ablation", "trials", "doctor", "evaluate", "overwrite", "retry_failed",
+    "trainer", "render.threads",
 )  # fmt: skip
 
 

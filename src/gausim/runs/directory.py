@@ -31,7 +31,9 @@ OWN_FILES = (
     CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS,
     MOTION,
 )  # fmt: skip
-OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
+# Files that Hydra makes before a job starts.
+HYDRA_FILES = (".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml", "train.log")
+OWN_FOLDERS = ("panels", "tensorboard", "csv", "wandb")
 
 
 class RunDirectory:
@@ -40,7 +42,7 @@ class RunDirectory:
     def __init__(self, path: Path | str) -> None:
         """Sets the path; :meth:`prepare` makes the directory."""
         self.path = Path(path)
-        self._prepared = False
+        self._prepared = self.has_stepped = False
 
     @property
     def checkpoint(self) -> Path:
@@ -169,6 +171,29 @@ class RunDirectory:
                     self._note(error)
             raise
 
+    @contextmanager
+    def leaving_no_trace(self, root: Path) -> Iterator[None]:
+        """Context of training: a new run that fails before its first step (``has_stepped``) is removed.
+
+        Its directory goes, and so do those above it, below ``root``, that are then empty.
+        """
+        is_new = not (self.path / EVENTS).is_file()
+        try:
+            yield
+        except Exception:
+            if is_new and not self.has_stepped and not getattr(rank_zero_only, "rank", 0):
+                self._clear()
+                for name in (LOCK, *HYDRA_FILES):
+                    (self.path / name).unlink(missing_ok=True)
+                with suppress(OSError):  # of files that are not ours
+                    (self.path / HYDRA_FILES[0]).parent.rmdir()
+                    self.path.rmdir()
+                    for folder in self.path.resolve().parents:
+                        if not folder.is_relative_to(root.resolve()):
+                            break
+                        folder.rmdir()
+            raise
+
     def _note(self, error: Exception) -> None:
         # Errors of gausim are self-explanatory; others get a traceback. The last line is the error itself.
         trace = "" if isinstance(error, GausSimError) else "".join(traceback.format_exception(error)) + "\n"
@@ -201,9 +226,9 @@ class RunDirectory:
         return None
 
     def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
-        """Whether a run of equal configuration is finished here, but not evaluated (on the part of its protocol)."""
+        """Whether a run of equal configuration is finished here, but not evaluated (on the part of its data)."""
         finished, measured = self.path / FINISHED, self.path / EVALUATION
-        if dict(config.get("protocol") or {}).get("part") == "test":
+        if config["data"].get("part") == "test":
             measured = self.path / TEST
         if not self.is_finished or changed_keys(self.config(), config):
             return False

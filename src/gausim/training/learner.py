@@ -15,7 +15,6 @@ from gausim.losses.objective import Objective
 from gausim.models.reference.reference import hand_motion
 from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
-from gausim.runs.checkpoint import WeightAverage
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.graphed import GraphedRollouts
@@ -59,7 +58,6 @@ class Learner(nn.Module):
         self.images.begins = self._begins
         self.supervision: Supervision = self.images if supervision is None else supervision
         self.baselines = Baselines(self.supervision)
-        self.average = WeightAverage(self.settings.ema_decay)
         self.ranks, self.barren, self.shown, self.measuring = Ranks(), 0, 0, False
         self.exchange = Exchange(self.ranks, method.model)
 

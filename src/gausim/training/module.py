@@ -51,7 +51,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         self.seed, self.fraction_every, self.measuring = seed, fraction_every, bool(fraction_every)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
-        self.plan, self.minutes = plan or TrainingPlan(), 0.0
+        self.plan, self.minutes = plan or TrainingPlan(schedule=None, warm_start=None), 0.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self.cost = not self.method.warns, TrainingCost()
 
@@ -144,7 +144,7 @@ class GausSimModule(OptimiserStep, LightningModule):
             self._warned = True
             warnings.warn(
                 f"the prediction has collapsed to the rest state: it moves with {100 * energy:.1f} % of the true "
-                "motion energy. Let T grow more slowly (plan.epochs_per_increase), raise "
+                "motion energy. Let T grow more slowly (plan.repeats), raise "
                 "optimizer.initial_lr or use loss.backprop_steps > 1.",
                 stacklevel=2,
             )
@@ -154,9 +154,8 @@ class GausSimModule(OptimiserStep, LightningModule):
     # ------------------------------------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the scenes' fingerprints, the averaged weights and the epoch's sums."""
+        """Adds the scenes' fingerprints and the epoch's sums."""
         own: dict[str, Any] = {"scenes": fingerprints(self.simulator.scenes)}
-        own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self.barren}
         own["baselines"] = self.baselines.state_dict()
         if isinstance(self.supervision, TrackSupervision):
@@ -172,7 +171,6 @@ class GausSimModule(OptimiserStep, LightningModule):
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
         self.take_notes(checkpoint)
         own = checkpoint["gausim"]
-        self.average.load_state_dict(own["average"])
         epoch = own["epoch"]
         self._sums, self.summary = epoch["sums"], epoch["summary"]
         self._warned, self.barren = epoch["warned"], epoch["barren"]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import AdamW, Optimizer
 
 from gausim.core import ConfigError
 
@@ -18,28 +18,32 @@ GROUPS = ("network", "scene", "template", "matrices", "initial")
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Optimiser and learning rates; ``conf/optimizer/default.yaml`` and ``conf/base/more.yaml`` explain the settings.
+    """Optimiser and learning rates by parameter group.
 
-    ``decay`` is the weight decay by group, of matrices and of all initial states: parameters that the data hardly
-    determine return to zero, where Adam alone would let them drift. The default ``optimizer`` is Adam. The plan of
-    a training multiplies the rates by factors.
+    Attributes:
+        optimizer: the optimiser as a function of its parameter groups; None: AdamW.
+        network_lr: learning rate of the graph network.
+        scene_lr: that of densities and attributes.
+        template_lr: that of the decoders of material.
+        initial_lr: that of initial states [diagonals per show].
+        clip_norm: norm to which loss gradients are clipped; 0: not at all.
+        clip_per_group: clip each group separately.
+        decay: weight decay by group, of matrices and of all initial states: parameters that the data hardly determine
+            return to zero, where Adam alone would let them drift.
     """
 
     optimizer: Callable[..., Optimizer] | None = None
-    network_lr: float = 8e-4
-    scene_lr: float = 8e-4
-    template_lr: float | None = None
-    initial_lr: float = 8e-4
+    network_lr: float = 1e-3
+    scene_lr: float = 0.1
+    template_lr: float = 5e-3
+    initial_lr: float = 2e-3
     clip_norm: float = 1.0
-    clip_per_group: bool = False
-    decay: Mapping[str, float] = field(default_factory=dict)
-    ema_decay: float = 0.0
+    clip_per_group: bool = True
+    decay: Mapping[str, float] = field(default_factory=lambda: {"network": 5.0})
 
     def __post_init__(self) -> None:
-        if min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0 or not (
-            0 <= self.ema_decay < 1
-        ):
-            raise ConfigError(f"optimizer: expected rates and clip_norm >= 0 and ema_decay in [0, 1), got {self}.")
+        if min(self.network_lr, self.scene_lr, self.template_lr, self.initial_lr, self.clip_norm) < 0:
+            raise ConfigError(f"optimizer: expected rates and clip_norm >= 0, got {self}.")
         wrong = [name for name, value in self.decay.items() if name not in GROUPS or not value >= 0]
         if wrong:
             raise ConfigError(f"optimizer.decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}.")
@@ -49,8 +53,8 @@ class OptimizerSettings:
 
         A parameter that a batch does not use has no loss gradient, and the optimiser skips it and its momentum.
         """
-        template = self.scene_lr if self.template_lr is None else self.template_lr
-        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, template, self.initial_lr), strict=True))
+        values = (self.network_lr, self.scene_lr, self.template_lr, self.template_lr, self.initial_lr)
+        rates = dict(zip(GROUPS, values, strict=True))
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
             parts: dict[float, list[Parameter]] = {0.0: []}  # parameters without decay come first
@@ -58,10 +62,10 @@ class OptimizerSettings:
                 decay = self.decay.get(name, 0.0) if p.ndim >= 2 or name == "initial" else 0.0
                 parts.setdefault(decay, []).append(p)
             for decay, part in parts.items():
-                own = {"weight_decay": decay} if self.decay else {}
+                own = {"lr": rates[name], "base_lr": rates[name], "name": name, "weight_decay": decay}
                 if part:
-                    made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name, **own})
-        return (self.optimizer or Adam)(made)
+                    made.append({"params": part, **own})
+        return (self.optimizer or AdamW)(made)
 
     def clip(self, optimizer: Optimizer) -> dict[str, Tensor]:
         """Clips the loss gradients; returns the norm of each named group before clipping."""

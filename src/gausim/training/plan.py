@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from gausim.core import ConfigError
-from gausim.nn.schedules import Schedule
+from gausim.nn.schedules import CosineSchedule, HalvingSchedule, Schedule
 
 # Epochs after a warm start, and without one; predicted frames in the first epoch without one.
 WARM_EPOCHS, COLD_EPOCHS, FIRST = 30, 60, 2
 # Predicted frames to which T grows by one at an increase, and the most that are chosen for longer videos: memory and
 # time of an optimiser step grow with T.
 USUAL, LONGEST = 15, 60
+
+SCHEDULES: dict[str, Schedule] = {"cosine": CosineSchedule(), "halving": HalvingSchedule()}
 
 
 @dataclass(frozen=True)
@@ -34,20 +36,19 @@ class WarmStart:
             which starts near the solution.
     """
 
-    updates: int = 300
-    growing: float = 0.5
-    decay: float = 0.0
-    sequences: int = 12
-    scene_lr: float = 0.1
-    template_lr: float = 1e-2
-    initial_lr: float = 2e-3
-    rate_factor: float = 0.2
+    updates: int = 900
+    growing: ClassVar[float] = 0.25
+    decay: ClassVar[float] = 0.05
+    sequences: ClassVar[int] = 12
+    scene_lr: ClassVar[float] = 0.1
+    template_lr: ClassVar[float] = 1e-2
+    initial_lr: ClassVar[float] = 2e-3
+    rate_factor: ClassVar[float] = 0.2
 
     def __post_init__(self) -> None:
-        if min(self.updates, self.sequences) < 1 or min(self.decay, self.rate_factor) < 0 or not 0 < self.growing <= 1:
+        if self.updates < 1:
             raise ConfigError(
-                "plan.warm_start: expected updates and sequences >= 1, decay and rate_factor >= 0 and growing in "
-                f"(0, 1], got {self}. Without a warm start it is null."
+                f"plan.warm_start.updates: expected at least 1, got {self.updates}. Without a warm start it is null."
             )
 
 
@@ -72,8 +73,8 @@ class TrainingPlan:
         batch_size: sequences per optimiser step, divided among the ranks; None: a third of all, 1 to 4.
         t_start: predicted frames T in epoch 0; None: ``t_max`` after a warm start, else 2.
         t_max: most predicted frames; None: all seen frames, at most 60.
-        epochs_per_increase: epochs between increases of T: by one, or by more where ``t_max`` is beyond 15.
-        schedule: factor on all learning rates by the part that is done; None: constant.
+        schedule: factor on all learning rates by the part that is done: ``cosine``, ``halving`` (METHOD section 4) or
+            another schedule; None: constant.
         shared_from: fraction of the training from which weights common to all scenes are trained.
         warm_start: the fit before the first step; None: training starts from rest and a material at random. It is left
             out where bodies are free or above a floor, and where they are in hands and compared with true points.
@@ -86,15 +87,14 @@ class TrainingPlan:
     batch_size: int | None = None
     t_start: int | None = None
     t_max: int | None = None
-    epochs_per_increase: int = 1
-    schedule: Schedule | None = None
+    schedule: Schedule | str | None = "cosine"
     shared_from: float = 0.0
-    warm_start: WarmStart | None = None
+    warm_start: WarmStart | None = WarmStart()
     max_minutes: float | None = None
     clock: str = "wall"
 
     def __post_init__(self) -> None:
-        counts = ("epochs", "repeats", "batch_size", "t_start", "t_max", "epochs_per_increase")
+        counts = ("epochs", "repeats", "batch_size", "t_start", "t_max")
         for name in counts:
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -103,6 +103,8 @@ class TrainingPlan:
             raise ConfigError(f"plan: expected t_start <= t_max, got {self.t_start} and {self.t_max}.")
         if not 0 <= self.shared_from < 1:
             raise ConfigError(f"plan.shared_from: expected a fraction in [0, 1), got {self.shared_from}.")
+        if isinstance(self.schedule, str) and self.schedule not in SCHEDULES:
+            raise ConfigError(f"plan.schedule: expected {', '.join(SCHEDULES)} or null, got '{self.schedule}'.")
         if self.clock not in ("wall", "cpu") or (self.max_minutes is not None and not self.max_minutes > 0):
             raise ConfigError(
                 f"plan: expected max_minutes > 0 or null and clock wall or cpu, got {self.max_minutes}, {self.clock!r}."
@@ -144,7 +146,7 @@ class TrainingPlan:
         """Predicted frames T in an epoch, counted from 0; T grows to 15 and to more in equally many epochs."""
         assert self.t_start is not None and self.t_max is not None, "expected a resolved plan"
         increase = max(1, math.ceil((self.t_max - self.t_start) / max(1, USUAL - self.t_start)))
-        return min(self.t_max, self.t_start + increase * (epoch // self.epochs_per_increase))
+        return min(self.t_max, self.t_start + increase * epoch)
 
     def time_fraction(self, minutes: float) -> float:
         """The part of the time limit that is used after some minutes of training; 0 without a limit."""
@@ -162,5 +164,6 @@ class TrainingPlan:
         if shared and progress < self.shared_from:
             return 0.0
         epochs = self.epochs or 1
-        factor = 1.0 if self.schedule is None else self.schedule.factor(round(progress * epochs, 9), epochs)
+        schedule = SCHEDULES[self.schedule] if isinstance(self.schedule, str) else self.schedule
+        factor = 1.0 if schedule is None else schedule.factor(round(progress * epochs, 9), epochs)
         return factor if self.warm_start is None or group == "network" else factor * self.warm_start.rate_factor

@@ -53,7 +53,6 @@ class OptimiserStep(Learner):
         stats = self._read(samples, whole, statistics.fetch(self.settings.clip(optimizer)))
         self.exchange.absorb()
         (advance or optimizer.step)()
-        self.average.update(self.named_parameters())
         self.shown = len(whole)
         return stats
 

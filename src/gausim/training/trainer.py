@@ -8,13 +8,12 @@ from pathlib import Path
 
 import torch
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import Logger
 
 from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
 from gausim.runs.cost import keep_freed_memory
-from gausim.training.callbacks.resume import ExactResume
+from gausim.training.callbacks.resume import ExactResume, RunCheckpoint
 from gausim.training.ranks.launch import Crew
 from gausim.training.ranks.layout import Layout, RanksStrategy
 
@@ -23,10 +22,25 @@ from gausim.training.ranks.layout import Layout, RanksStrategy
 class TrainerSettings(Layout):
     """Precision and devices of a training: the keys of ``conf/trainer`` explain the settings."""
 
-    threads: int | None = None
-    precision: str = "32-true"
-    log_every_n_steps: int = 20
+    threads: int | None = 1
     progress: bool = True
+    log_every_n_steps: int = 20
+    checkpoint_minutes: float = 1.0
+    checkpoint_steps: int = 0
+    panel_epochs: int = 5
+    motion_epochs: int = 10
+
+    def callbacks(self, *, has_videos: bool = True) -> list[Callback]:
+        """The callbacks that save, report and watch a run."""
+        from gausim.training.callbacks.motion_watch import MotionWatch
+        from gausim.training.callbacks.panels import Panels
+        from gausim.training.callbacks.progress import EpochSummary, Progress
+
+        saving = RunCheckpoint(every_minutes=self.checkpoint_minutes, every_steps=self.checkpoint_steps)
+        found: list[Callback] = [saving, EpochSummary(console=self.progress)]
+        found += [Panels(every_epochs=self.panel_epochs)] if self.panel_epochs and has_videos else []
+        found += [MotionWatch(every_epochs=self.motion_epochs)] if self.motion_epochs else []
+        return [*found, Progress()] if self.progress else found
 
 
 def make_trainer(
@@ -54,16 +68,14 @@ def make_trainer(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
-    own: list[Callback] = [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
     return Trainer(
         max_epochs=epochs,
         accelerator=settings.accelerator,
         devices=settings.devices,
         num_nodes=settings.num_nodes,
         strategy="auto" if environment is None else RanksStrategy(),
-        precision=settings.precision,  # type: ignore[arg-type]
         logger=list(loggers) or False,
-        callbacks=[*own, ExactResume()],
+        callbacks=[*callbacks, ExactResume()],
         log_every_n_steps=settings.log_every_n_steps,
         enable_progress_bar=settings.progress,
         enable_model_summary=False,

@@ -11,7 +11,7 @@ from torch import Tensor
 from gausim.core import ConfigError, RunError
 from gausim.models.step.predictor import with_floor_columns
 from gausim.models.step.simulator import GausSim
-from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, scene_text
+from gausim.runs.checkpoint import fingerprints, read_checkpoint, scene_text
 from gausim.runs.comparison import differing_keys
 from gausim.runs.directory import RunDirectory
 
@@ -73,9 +73,9 @@ def unlike(run_dir: Path | str, model: Mapping[str, Any]) -> list[str]:
 
 
 def _read(run_dir: Path | str) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
-    """A trained simulator's weights by name (moving averages where the run has them), and its scenes."""
+    """A trained simulator's weights by name, and its scenes."""
     checkpoint = read_checkpoint(RunDirectory(run_dir).checkpoint)
-    weights = averaged_weights(checkpoint).items()
+    weights = checkpoint["state_dict"].items()
     own = {name.removeprefix(_PREFIX): value for name, value in weights if name.startswith(_PREFIX)}
     return own, checkpoint["gausim"]["scenes"]
 

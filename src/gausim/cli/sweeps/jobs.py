@@ -77,8 +77,8 @@ def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
             return None
         print(f"left out, finished before: {run.path}", flush=True)
         return _finished(run, FINISHED_BEFORE)
-    if run.has_failed and not cfg.sweep.retry_failed:
-        print(f"left out, failed before (sweep.retry_failed=true tries again): {run.path}", flush=True)
+    if run.has_failed and not cfg.retry_failed:
+        print(f"left out, failed before (retry_failed=true tries again): {run.path}", flush=True)
         return JobResult.of(None, FAILED_BEFORE, run, run.failure())
     return None
 
@@ -127,5 +127,5 @@ def conclude(folder: Path, results: Sequence[JobResult]) -> None:
         lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
         raise RunError(
             f"{len(failed)} of {len(results)} jobs failed:{''.join(lines)}\n"
-            "The same command with sweep.retry_failed=true tries these again, from their last checkpoints."
+            "The same command with retry_failed=true tries these again, from their last checkpoints."
         )

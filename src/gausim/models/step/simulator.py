@@ -21,7 +21,7 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.material import MaterialTemplate
-from gausim.models.template.template import Template
+from gausim.models.template.template import RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 
@@ -41,7 +41,7 @@ class GausSim(SceneModel):
         features: FeatureOptions = DEFAULT_FEATURES,
         network: Callable[..., nn.Module] = MeshGraphNet,
         head: Head = DEFAULT_HEAD,
-        template: Callable[..., Template] = MaterialTemplate,
+        template: Callable[..., Template] | None = MaterialTemplate,
         conserve_mass: bool = True,
         conserve_momentum: bool = True,
         rollout: RolloutSettings = DEFAULT_ROLLOUT,
@@ -55,7 +55,7 @@ class GausSim(SceneModel):
             features: choice of the network's input features.
             network: called with node_features=, edge_features= and outputs=.
             head: map from the network's output to deformation gradients.
-            template: state that F deforms; called with (hierarchies, finest level, attributes=,
+            template: state that F deforms, None: the rest state; called with (hierarchies, finest level, attributes=,
                 frames= (axes of the scenes), conserve_volume=conserve_mass).
             conserve_mass: normalise to det F = 1.
             conserve_momentum: compute the momentum loss.
@@ -67,7 +67,7 @@ class GausSim(SceneModel):
         """
         super().__init__(scenes, fps, hierarchy, features.attributes)
         self.conserve_momentum, self.rollout = conserve_momentum, rollout
-        self.template = template(
+        self.template = (template or RestTemplate)(
             self.hierarchies, self.predicted_levels[-1], attributes=features.attributes, frames=self.body_axes,
             conserve_volume=conserve_mass,
         )  # fmt: skip

@@ -47,7 +47,7 @@ class MotionWatch(Callback):
         """Measures every ``every_epochs`` epochs (0: never) and after the last, on ``sequences`` of each object."""
         if every_epochs < 0 or sequences < 1:
             raise ConfigError(
-                f"callbacks.motion: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
+                f"MotionWatch: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
             )
         self._every, self._sequences = every_epochs, sequences
 

@@ -38,9 +38,7 @@ class Panels(Callback):
     def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
         """Renders the first ``objects`` every ``every_epochs`` epochs (0: never) and after the last."""
         if every_epochs < 0 or objects < 1:
-            raise ConfigError(
-                f"callbacks.panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}."
-            )
+            raise ConfigError(f"Panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}.")
         self._every, self._objects = every_epochs, objects
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -14,23 +14,16 @@ from lightning.pytorch.callbacks import Checkpoint
 from gausim.core import ConfigError
 from gausim.runs.checkpoint import LAST_CHECKPOINT, digest
 from gausim.runs.randomness import random_state, restore_random_state
-from gausim.training.callbacks.cadence import has_come
 from gausim.training.ranks.ranks import Ranks
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves ``last.ckpt`` periodically, also within epochs, and numbered snapshots on request."""
+    """Saves ``last.ckpt`` after every epoch, and within epochs."""
 
-    def __init__(
-        self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
-    ) -> None:
-        """``conf/base/more.yaml`` explains the settings; they have no effect on the result of training."""
-        if every_epochs < 1 or min(every_minutes, every_steps, snapshot_every) < 0:
-            raise ConfigError(
-                "callbacks.checkpoint: expected every_epochs >= 1 and every_minutes, every_steps, snapshot_every >= 0, "
-                f"got {every_epochs}, {every_minutes}, {every_steps} and {snapshot_every}."
-            )
-        self._every, self._snapshot_every = every_epochs, snapshot_every
+    def __init__(self, *, every_minutes: float = 1.0, every_steps: int = 0) -> None:
+        """Minutes and optimiser steps after which it saves within an epoch, 0: never; without effect on the result."""
+        if min(every_minutes, every_steps) < 0:
+            raise ConfigError(f"trainer.checkpoint_*: expected at least 0, got {every_minutes} and {every_steps}.")
         self._minutes, self._steps = every_minutes, every_steps
         self._saved_at, self._saved_step = time.monotonic(), 0
 
@@ -46,13 +39,8 @@ class RunCheckpoint(Checkpoint):
             self._save(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Saves if the epoch is due, with the optimiser's state (Lightning calls this callback last)."""
-        if has_come(trainer, self._every) or self._due(trainer):
-            self._save(trainer)
-        epoch = trainer.current_epoch + 1
-        if self._snapshot_every and epoch % self._snapshot_every == 0:
-            snapshots = Path(trainer.default_root_dir) / "snapshots"
-            trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
+        """Saves with the optimiser's state (Lightning calls this callback last)."""
+        self._save(trainer)
 
     def _due(self, trainer: Trainer) -> bool:
         if self._steps and trainer.global_step - self._saved_step >= self._steps:

@@ -1,0 +1,150 @@
+"""The command line of `gausim train`: a job or a sweep under Hydra, after checks that need no data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hydra import version
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from gausim.compose.ablations import check_ablations
+from gausim.compose.config import compose
+from gausim.compose.errors import one_sentence, suggestion
+from gausim.compose.root import HYDRA_VERSION_BASE, ROOT_FILE, conf_dir, options
+from gausim.compose.targets import check_hydra
+from gausim.core.errors import ConfigError, GausSimError
+
+
+@dataclass
+class Job:
+    """Callable for every job of Hydra; defined here so that unpickling it in a worker registers our resolvers."""
+
+    task: Callable[[DictConfig], float | None]
+    error: GausSimError | None = None  # kept from Hydra, which would print all overrides before it
+
+    def __call__(self, config: DictConfig) -> float | None:
+        """Runs the job."""
+        try:
+            return self.task(config)
+        except GausSimError as error:
+            self.error = error
+            return None
+
+
+def run_hydra(task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
+    """Runs a task under Hydra: overrides, `-m`, `--cfg job` (with `-m` of every job), and Hydra's other options.
+
+    ``task`` is a function of the composed configuration. Returns the exit status.
+
+    Raises:
+        ConfigError: a key, group or option is unknown, a value is missing, or an ablation does not act.
+    """
+    given = get_args_parser().parse_args(list(argv))
+    sweep, folders = given.multirun, [Path(given.config_dir).resolve()] if given.config_dir else []
+    with one_sentence(given.overrides):
+        words = with_data_directories(given.overrides, sweep=sweep, folders=folders)
+        words += [f"hydra.searchpath=['file://{folder}']" for folder in folders]
+        if given.cfg and sweep:
+            for number, own in enumerate(jobs_of(words)):
+                print(f"---\n# job {number}: {' '.join(own)}\n{OmegaConf.to_yaml(compose(own))}", end="")
+            return 0
+        if not (given.shell_completion or given.info or given.cfg):
+            _check(words, sweep=sweep)
+        version.setbase(HYDRA_VERSION_BASE)
+        path = create_config_search_path(str(conf_dir()))
+        hydra = Hydra.create_main_hydra2(task_name=ROOT_FILE, config_search_path=path)
+        try:
+            if given.shell_completion:
+                hydra.shell_completion(ROOT_FILE, words)
+            elif given.info:
+                hydra.show_info(given.info, ROOT_FILE, words)
+            elif given.cfg:
+                hydra.show_cfg(ROOT_FILE, words, given.cfg, given.package, given.resolve)
+            else:
+                _run(hydra, Job(task), words, sweep=sweep)
+        finally:
+            GlobalHydra.instance().clear()
+    return 0
+
+
+def _run(hydra: Hydra, job: Job, words: Sequence[str], *, sweep: bool) -> None:
+    if sweep:
+        hydra.multirun(ROOT_FILE, job, [*words, "hydra.mode=MULTIRUN"])
+    else:
+        hydra.run(ROOT_FILE, job, [*words, "hydra.mode=RUN"])
+    if job.error is not None:
+        raise job.error
+
+
+def run_dir() -> Path:
+    """Returns the directory of the running job (only inside `run_hydra`; in a sweep that of the job)."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def _check(words: Sequence[str], *, sweep: bool) -> None:
+    """Checks every job before Hydra builds its logging, callbacks and launcher, and makes a directory."""
+    config = compose(_without_lists(words), with_hydra=True)
+    check_hydra(config.hydra)
+    if not sweep and config.hydra.sweeper.get("params"):
+        raise ConfigError(f"experiment={config.hydra.runtime.choices.experiment}: is several trainings, so add -m.")
+    jobs = list(jobs_of(words)) if sweep else [list(words)]
+    if not jobs:
+        raise ConfigError(f"{' '.join(words)}: expected at least one value of every key, so there is nothing to run.")
+    for job in jobs:
+        check_hydra(compose(job, with_hydra=True).hydra)
+        check_ablations(job)
+
+
+def with_data_directories(words: Sequence[str], *, sweep: bool = False, folders: Sequence[Path] = ()) -> list[str]:
+    """The overrides with directories in `data=` as `data=object` and absolute `data.root=`.
+
+    A ``sweep`` over several data sets without a name is called "sweep".
+
+    Raises:
+        ConfigError: a value is neither a name of conf/data nor a directory.
+    """
+    known, found = options("data", *folders), []
+    named = any(word.startswith(("name=", "experiment=")) for word in words)
+    for word in words:
+        key, _, value = word.partition("=")
+        values = value.split(",")
+        if key != "data" or value in ("null", "???") or any(mark in value for mark in "[('$"):
+            found.append(word)
+            continue
+        paths = [Path(text).expanduser() for text in values if text not in known]
+        absent = [str(path) for path in paths if not path.is_dir()]
+        if absent:
+            raise ConfigError(
+                f"data={absent[0]}: neither a directory nor a name of conf/data.{suggestion(absent[0], known)}"
+            )
+        if paths and len(paths) < len(values):
+            raise ConfigError(f"{word}: expected names of conf/data or directories, not both.")
+        roots = ",".join("'" + str(path.resolve()).replace("'", "\\'") + "'" for path in paths)
+        found += ["data=object", f"data.root={roots}"] if paths else [word]
+        found += ["name=sweep"] if sweep and len(values) > 1 and not named else []
+    return found
+
+
+def jobs_of(words: Sequence[str]) -> Iterator[list[str]]:
+    """The overrides of every job of a sweep, as the grid sweeper makes them."""
+    params = compose(_without_lists(words), with_hydra=True).hydra.sweeper.get("params") or {}
+    search = ConfigLoaderImpl(create_config_search_path(str(conf_dir())))  # glob(...) asks it for the choices
+    parser = OverridesParser.create(config_loader=search)
+    parsed = parser.parse_overrides([*(f"{key}={value}" for key, value in params.items()), *words])
+    for batch in BasicSweeper.split_arguments(parsed, None):
+        yield from batch
+
+
+def _without_lists(words: Sequence[str]) -> list[str]:
+    """The overrides without those that are swept over."""
+    parsed = OverridesParser.create().parse_overrides(list(words))
+    return [word for word, override in zip(words, parsed, strict=True) if not override.is_sweep_override()]

@@ -1,0 +1,124 @@
+"""A scene without videos: moved by the network of a trained run and a chosen material, or by the template alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import OmegaConf
+
+from gausim.compose.config import compose, instantiate
+from gausim.compose.device import find_device
+from gausim.compose.live import energy_ceiling
+from gausim.core import GaussianScene, SimState
+from gausim.core.errors import ConfigError
+from gausim.core.state import initial_sway
+from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+from gausim.interaction.session import MadeWith
+from gausim.models.rollout.dynamics import scene_dynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
+from gausim.ops.selection import require_pinned
+from gausim.runs.directory import RunDirectory
+from gausim.training.pretraining import give_even_material
+from gausim.training.transfer import load_shared
+
+# The model without a trained run: its untrained network outputs zero, so that only the template acts.
+UNTRAINED = "gausim"
+
+
+@dataclass(frozen=True)
+class EvenMaterial:
+    """The material of a body that was never filmed, the same everywhere.
+
+    Raises:
+        ConfigError: a number is not positive and finite.
+    """
+
+    # over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s]
+    stiffness: float = 1.0
+    damping: float = 0.5  # amplitudes fall as exp(-damping t / 2) [1 / s]
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"--{name} {value:g}: expected a number > 0.")
+
+    @property
+    def period(self) -> float:
+        """Period of the slowest swing [s]."""
+        return 1 / math.sqrt(self.stiffness)
+
+
+def open_scene(
+    scene: GaussianScene,
+    *,
+    fps: float,
+    base: Path | None = None,
+    material: EvenMaterial | None = None,
+    seed: int = 0,
+    sway: float = 0.0,
+    gravity: float | None = None,
+    most_force: float | None = None,
+    keep: int | None = 0,
+    device: str = "cpu",
+) -> Interaction:
+    """Opens a scene without videos, some of its kernels pinned, for interaction.
+
+    ``base`` is a trained run of the neural simulator whose network and decoders move it, with an even ``material``;
+    None: an untrained model of this ``seed``, of the reference material where no ``material`` is given. ``sway`` is the
+    initial displacement per frame of the kernel farthest from the pins [diagonals], ``gravity`` the unit of weight
+    [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the number of latest frames that
+    are kept (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
+
+    Raises:
+        SceneError: no kernel is pinned.
+        ConfigError: there is no such device, the frame rate is not positive and finite, or ``base`` is a run of
+            another model.
+    """
+    if not (math.isfinite(fps) and fps > 0):
+        raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
+    require_pinned(scene)
+    torch.manual_seed(seed)
+    if base is None:
+        model = _built(compose([f"model={UNTRAINED}"]).model.simulator, scene, fps)
+    else:
+        model = _of_base(scene, fps, base)
+    if material is None and base is not None:
+        material = EvenMaterial()
+    if material is not None:
+        give_even_material(model, 0, period=material.period, damping=material.damping)
+    place, swaying = find_device(device), initial_sway(scene, sway)
+    initial = SimState(swaying.positions.to(place), swaying.previous.to(place))
+    model = model.to(place)
+    dynamics = scene_dynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
+    run = "untrained" if base is None else base.resolve().name
+    made_with = MadeWith.of(scene, model, initial, settings=UNTRAINED, run=run)
+    return Interaction(
+        scene, dynamics, dynamics.masses, initial, made_with=made_with, units=tuple(model.units_of_kernels(0)),
+        gravity=STANDARD_GRAVITY if gravity is None else gravity,
+        most_force=MOST_FORCE if most_force is None else most_force, keep=keep,
+    )  # fmt: skip
+
+
+def _of_base(scene: GaussianScene, fps: float, base: Path) -> GausSim:
+    """The simulator of a run's configuration with its shared weights."""
+    config = RunDirectory(base).config().get("model", {})
+    node = OmegaConf.create(config).get("simulator")
+    model = None if node is None else _built(node, scene, fps)
+    if model is None or not isinstance(model.template, MaterialTemplate):
+        raise ConfigError(
+            f"--from {base}: expected a run of the neural simulator (model=gausim), whose attributes are stiffness and "
+            "damping. Pretrain one: `gausim train experiment=pretrain data.root=CORPUS`."
+        )
+    load_shared(model, base, config)
+    model.freeze(scenes=True)
+    return model.eval()
+
+
+def _built(node: Any, scene: GaussianScene, fps: float) -> GausSim:
+    return cast("GausSim", instantiate(node, scenes=[scene], fps=[fps])())
