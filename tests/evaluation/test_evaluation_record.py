@@ -69,16 +69,6 @@ def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
     assert absent_metrics(30) == {"lpips": "images under 31 pixels"} and len(default_metrics(30)) == 5
 
 
-def test_flip_is_measured_where_it_is_wanted(toy):
-    pytest.importorskip("flip_evaluator")
-    methods = {"oracle": Oracle(toy)}
-    curves = evaluate_object(
-        ObjectData(toy.root), toy.scene, methods, ReferenceRenderer(), sequences=["seq_000"], views=["cam_2"], flip=True
-    )
-    found = {row: rows["flip"] for row, rows in curves.values.items() if "flip" in rows}
-    assert found["oracle"].max() < 0.02 < found["static"].max()
-
-
 def test_the_first_sequence_warms_up(monkeypatch):
     monkeypatch.setattr(cost, "_begin", lambda cuda: None)
     now = [0.0]
@@ -157,12 +147,3 @@ def test_pictures_keep_the_background_that_was_seen(toy):
     blue = pictures.background[0, 0, :, 2].tolist()
     # Covered throughout: the mean of what was seen, weighted by how often; uncovered: 100; always free: 200.
     assert blue[2:] == [100, 100, 200, 200, 200, 200] and blue[0] == blue[1] == round((2 * 100 * 2 + 4 * 200 * 4) / 20)
-
-
-def test_recordings_without_background_have_none_and_large_ones_shrink(toy, monkeypatch):
-    recorder = PictureRecorder(ObjectData(toy.root), "seq_000", ["cam_2", "cam_0"])
-    pixels = torch.zeros(1, 2, 240, 480, 4, dtype=torch.uint8)
-    recorder.add(pixels, {})
-    pictures = recorder.finish()
-    assert pictures.background is None and pictures.truth.shape == (1, 2, 96, 192, 4)
-    assert pictures.views == ("cam_2", "cam_0") and pictures.heldout_views == ("cam_2",)

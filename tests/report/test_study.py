@@ -6,7 +6,6 @@ import pytest
 from helpers import report_runs
 from helpers.report_runs import config, evaluate, make_curves, study_of, write_run
 
-from gausim.core import RunError
 from gausim.report.commands import joined
 from gausim.report.runs import find_runs
 from gausim.report.study import EFFECT, EFFECT_SIGMA, Study
@@ -43,14 +42,6 @@ def test_runs_are_found_once_and_the_report_is_not_searched(sweep):
     names = [run.name for run in find_runs([sweep / "full", sweep / "no_mass"])]
     assert names == ["full/seed_0", "full/seed_1", "no_mass/seed_0"]
     assert [run.name for run in find_runs([sweep / "full" / "seed_1"])] == ["seed_1"]
-
-
-def test_nothing_found_says_what_to_do(tmp_path):
-    with pytest.raises(RunError, match="no such directory"):
-        find_runs([tmp_path / "nowhere"])
-    (tmp_path / "config.yaml").write_text("site: mkdocs\n")  # of another program
-    with pytest.raises(RunError, match="no run in here.*Train and evaluate first"):
-        find_runs([tmp_path])
 
 
 @pytest.mark.parametrize(
@@ -138,16 +129,6 @@ def on_object(name, rate, **data):
     return settings
 
 
-def test_one_sweep_over_several_objects_has_one_row_for_each_setting(tmp_path):
-    for rate in (12.0, 5.0):
-        for name in ("one", "two"):  # the keys by which only objects differ name no row
-            settings = on_object(name, rate, selections={"pinned": name}, views=f"[{name}]")
-            evaluate(write_run(tmp_path / f"{name}_{rate}", settings), make_curves(rate, name=name))
-    assert [(g.label, sorted(g.objects)) for g in study_of(tmp_path).groups] == [
-        ("gausim (network_lr=5.0)", ["one", "two"]), ("gausim (network_lr=12.0)", ["one", "two"]),
-    ]  # fmt: skip
-
-
 def test_a_method_whose_settings_were_chosen_for_each_object_is_one_row_and_told(tmp_path):
     for name, rate in (("one", 0.001), ("two", 0.01)):
         evaluate(write_run(tmp_path / name, on_object(name, rate)), make_curves(rate, name=name))
@@ -191,18 +172,6 @@ def test_why_there_is_no_number(sweep):
     (failed / "FAILED").write_text("")
     (group,) = [g for g in study_of(sweep).groups if g.variation == "w/o momentum"]
     assert group.state("toy_bunny", "l2") == "failed" and len(group.runs) == 2
-
-
-def test_runs_that_take_over_from_runs_of_other_seeds_or_objects_are_one_row(tmp_path):
-    for name, error in (("toy_bunny", 1.0), ("toy_cube", 2.0)):
-        for seed in (0, 1):
-            own = config(seed) | {"data": {"root": "/data/toy", "names": [name], "seed": seed}}
-            own |= {"model": {"method": {"_target_": "physgaussian"}}, "init_from": f"out/{name}/seed_{seed}"}
-            run = write_run(tmp_path / name / f"seed_{seed}", own, model="physgaussian")
-            evaluate(run, make_curves(error + seed, name=name))
-    study = study_of(tmp_path)
-    assert [group.label for group in study.groups] == ["physgaussian"]
-    assert [l2(study, "physgaussian", name).value for name in study.objects] == pytest.approx([3.0, 5.0])
 
 
 def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs():

@@ -38,18 +38,12 @@ def evaluate(arguments: argparse.Namespace) -> int:
     if arguments.flip:
         FLIP()  # where it is not installed it is refused before a look is counted
     run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
-    facts = {
-        "name": run.config.get("name"),
-        "seed": run.config.get("seed"),
-        "views": arguments.cameras,
-        **state_of(run),
-    }
+    facts = {**{key: run.config.get(key) for key in ("name", "seed")}, "views": arguments.cameras, **state_of(run)}
     part, sequences = _choose(run, arguments)
     if arguments.test:
         facts |= _look(run, arguments, sequences, facts)
-        run = load_run(
-            arguments.run, data=data_option(arguments.data), device=arguments.device
-        )  # now the test part is open
+        # Now the test part is open.
+        run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     elif part:
         facts |= {"part": part}
     results = _evaluate(run, arguments, sequences)

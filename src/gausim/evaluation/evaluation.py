@@ -131,7 +131,13 @@ def evaluate_object(
     """
     records = _chosen(data, sequences)  # before the task, which reads the true motion of all
     side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-    task = _task(data, scene, methods, renderer, views, default_metrics(side, flip=flip))
+    reference, points = Reference(data, scene), data.rest_points
+    task = _Task(
+        data, scene, methods, renderer, list(data.views if views is None else views), default_metrics(side, flip=flip),
+        reference, SceneAppearance.of(scene, scene.foreground),
+        None if points is None else attach_points(scene, points),
+        _linear_references(data) if reference.name == STATIC else {},
+    )  # fmt: skip
     totals, results, pictures = _Totals(task), list[Rows](), PictureRecorder(data, records[0].name, task.views)
     for record in records:
         # A separate record, so that its decoded frames are freed with it.
@@ -177,29 +183,6 @@ def results_of(objects: Sequence[ObjectCurves], run: dict[str, Any]) -> Results:
     infos = {curves.facts.name: info_of(curves) for curves in objects}
     known = code_provenance()
     return Results(SCHEMA, run=run, provenance=known, objects=infos, metrics=metrics_of(objects), table=table)
-
-
-def _task(
-    data: ObjectData,
-    scene: GaussianScene,
-    methods: Mapping[str, Predict],
-    renderer: Renderer,
-    views: Sequence[str] | None,
-    chosen: list[metrics.ImageMetric],
-) -> _Task:
-    reference, points = Reference(data, scene), data.rest_points
-    return _Task(
-        data,
-        scene,
-        methods,
-        renderer,
-        list(data.views if views is None else views),
-        chosen,
-        reference,
-        SceneAppearance.of(scene, scene.foreground),
-        None if points is None else attach_points(scene, points),
-        _linear_references(data) if reference.name == STATIC else {},
-    )
 
 
 def _record(task: _Task, totals: _Totals, absent: dict[str, str]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""First screens of a report: per run a video, three sentences, and one table."""
+"""First screens of a report: per run a video, two sentences, and one table."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Opening:
     row: str  # label of its row
     seed: str  # its seed, empty if there is one only
     run: RunRecord  # of the video
-    sentences: tuple[str, str, str]  # over all seeds of the row
+    sentences: tuple[str, str]  # over all seeds of the row
     grid: Grid | None
     film: Film | None
     problem: str  # reason for a missing video, and the remedy

@@ -25,7 +25,7 @@ _LATEX = {
 
 def latex_table(grid: Grid, made: Made) -> str:
     """The table for LaTeX, its origin in comments and caption."""
-    head, *body = (" & ".join(line) + r" \\" for line in texts(grid, latex_escape, r"\textbf{{{}}}"))
+    head, *body = (" & ".join(line) + r" \\" for line in texts(_flat(grid), latex_escape, r"\textbf{{{}}}"))
     label = re.sub(r"[^A-Za-z0-9]+", "-", grid.title)
     caption = latex_escape(f"{grid.title}. {grid.caption}")
     stubs = len(grid.stub.split(" | "))
@@ -34,7 +34,7 @@ def latex_table(grid: Grid, made: Made) -> str:
         r"\begin{table*}[ht]", r"\centering", rf"\caption{{{caption}}}", rf"\label{{tab:{label}}}",
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         rf"\begin{{tabular}}{{{'l' * stubs}{'c' * len(grid.columns)}}}", r"\toprule",
-        *_groups(grid, stubs), head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}}",
+        head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}}",
         r"\end{table*}", "",
     ])  # fmt: skip
 
@@ -48,11 +48,6 @@ def grouped(grid: Grid) -> list[tuple[str, int]]:
         else:
             found.append((column.group, 1))
     return found if any(name for name, _ in found) else []
-
-
-def _groups(grid: Grid, stubs: int) -> list[str]:
-    found = [rf"\multicolumn{{{count}}}{{c}}{{{latex_escape(name)}}}" for name, count in grouped(grid)]
-    return [" & ".join([*[""] * stubs, *found]) + r" \\"] if found else []
 
 
 def _flat(grid: Grid) -> Grid:

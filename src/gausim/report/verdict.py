@@ -1,4 +1,4 @@
-"""Verdict on a method's predictions of an object: key figures and three sentences."""
+"""Verdict on a method's predictions of an object: key figures and two sentences."""
 
 from __future__ import annotations
 
@@ -31,8 +31,6 @@ _LIVELINESS = (
     (2.0, "it is livelier than the object"),
     (math.inf, "it gains energy that the object does not have"),
 )
-# Difference within which images of two views count as equally good [dB].
-_SAME_DB = 1.0
 _EVALUATE = "`gausim evaluate RUN` measures it."
 
 
@@ -45,9 +43,6 @@ class Outcome:
     error: float | None  # on unseen frames, over the reference's
     seen_error: float | None  # the same on seen frames
     energy: float | None  # predicted over true motion energy on unseen frames
-    psnr: dict[str, float | None]  # by train and heldout views, of unseen frames [dB]
-    still_psnr: dict[str, float | None]  # the same of the reference
-    heldout_views: tuple[str, ...]
     seeds: int  # number of evaluations
     repeats: bool  # whether the method repeats its fitted motion instead of extrapolating
     reference: str  # what the reference predicts, in words
@@ -70,25 +65,21 @@ def outcome(pivot: Pivot, name: str, row: str, info: ObjectInfo, method: str | N
     in_3d = any(mean(row, part, "points", ERROR_3D + RATIO) is not None for part in ("seen", "unseen"))
     measured, ratio = ("points", ERROR_3D + RATIO) if in_3d else ("train", "l2" + RATIO)
     cell = pivot.cell(row, (name, split, measured, ratio))
-    views = ("train", "heldout")
     return Outcome(
         frames=(start, stop - 1) if stop else None,
         measured=measured,
         error=mean(row, "unseen", measured, ratio),
         seen_error=mean(row, "seen", measured, ratio),
         energy=mean(row, split, measured, MOTION_ENERGY),
-        psnr={group: mean(row, split, group, "psnr") for group in views},
-        still_psnr={group: mean(info.reference, split, group, "psnr") for group in views},
-        heldout_views=tuple(info.heldout_views),
         seeds=1 if cell is None else len(cell.seeds),
         repeats=info.repeats(method or row),
         reference=NAMES.get(info.reference, info.reference),
     )
 
 
-def sentences(found: Outcome) -> tuple[str, str, str]:
-    """Three sentences on the prediction: its error, its motion energy, and its images in held-out views."""
-    return _error(found), _energy(found), _views(found)
+def sentences(found: Outcome) -> tuple[str, str]:
+    """Two sentences on the prediction: its error, and its motion energy."""
+    return _error(found), _energy(found)
 
 
 def _error(found: Outcome) -> str:
@@ -128,39 +119,6 @@ def _energy(found: Outcome) -> str:
     if 0.8 <= found.energy < 1.25 and found.merit >= NO_BETTER:
         words = "it moves as much as the object, but not as the object does"
     return f"Its motion there has {found.energy:.2f} times the energy of the true motion: {words}."
-
-
-def _views(found: Outcome) -> str:
-    new, trained = found.psnr["heldout"], found.psnr["train"]
-    if new is None and trained is None:
-        return f"Nothing says how good its images are (PSNR): {_EVALUATE}"
-    if new is None:
-        where = "No view was kept out of training, so nothing tells how it looks from elsewhere"
-        if found.heldout_views:
-            where = f"Nothing was measured in {_names(found.heldout_views)}, `gausim evaluate RUN` does"
-        return f"{where}; in the training views its images have a PSNR of {trained:.1f} dB{_gain(found, 'train')}."
-    beside = ""
-    if trained is not None:
-        apart = new - trained
-        than = "about as good as" if abs(apart) < _SAME_DB else "better than" if apart > 0 else "worse than"
-        beside = f", {than} in the training views ({trained:.1f} dB)"
-    begin = f"In {_names(found.heldout_views)}, its images have a PSNR of {new:.1f} dB"
-    return f"{begin}{beside}{_gain(found, 'heldout')}."
-
-
-def _names(views: Sequence[str]) -> str:
-    which = "a view" if len(views) < 2 else f"{len(views)} views"
-    return f"{which} that it was never trained on" + (f" ({', '.join(views)})" if views else "")
-
-
-def _gain(found: Outcome, views: str) -> str:
-    """Gain over the reference, as the end of a sentence."""
-    own, still = found.psnr[views], found.still_psnr[views]
-    if own is None or still is None:
-        return ""
-    gain = own - still
-    side = "above" if gain >= 0 else "below"
-    return f" and {abs(gain):.1f} dB {side} those of a model that predicts {found.reference}"
 
 
 def _words(scale: Sequence[tuple[float, str]], value: float) -> str:
