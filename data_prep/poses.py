@@ -59,8 +59,9 @@ def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldO
         found, points, results = _map(work, material, mapping, tick)
     else:
         found, points = material.posed
-        results = {"images": len(found), "registered": len(found), "failed": []}
-    results["cameras"] = _lenses(found)
+        without = list(material.without_pose)
+        results = {"images": len(found) + len(without), "registered": len(found), "failed": [], "without_pose": without}
+    results["cameras"], results["note"] = _lenses(found), material.note
     move, results["world"] = place(found, world, mapped=material.posed is None)
     results["reprojection"] = reprojection(found, points)
     moved = [replace(shot, viewmat=move.viewmat(shot.viewmat)) for shot in found]
@@ -122,7 +123,10 @@ def _map(
             photo = open_photo(first, f"{folder.name}/{name}{first.suffix}")
             photos.append(photo)
             cameras[photo.name] = name
-    folder, features, matches, others = map_photos(photos, cameras, work, options, tick)
+    try:
+        folder, features, matches, others = map_photos(photos, cameras, work, options, tick)
+    except DataError as error:
+        raise DataError(f"{error} {material.note}".strip()) from error
     model = read_colmap(folder)
     found = from_model(model, {photo.name: photo for photo in photos})
     failed = failures(photos, found, features, matches)
@@ -164,6 +168,11 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
     for photo in results["failed"]:
         facts = f"{photo['features']} features, {photo['matches']} matches"
         lines.append(f"  without pose {photo['name']} ({facts}): {photo['remedy']}")
+    if results.get("without_pose"):
+        names = ", ".join(results["without_pose"][:_NAMED])
+        lines.append(f"without pose   {len(results['without_pose'])} photos: {names} …")
+    if results["note"]:
+        lines.append(f"note           {results['note']}")
     if results.get("other_models"):
         lines.append(f"  apart        models of {results['other_models']} images; add photos between them")
     if error["mean"] is not None:

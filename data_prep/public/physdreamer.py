@@ -2,10 +2,10 @@
 
 ROOT is physics_dreamer/OBJECT: sparse/0 (COLMAP) or transforms_train.json, images/, point_cloud.ply,
 moving_part_points.ply and clean_object_points.ply, and in videos/ films whose names begin with that of the still from
-whose place they were made. Kernels near the moving cloud are simulated, near the object's cloud foreground; those of
-the object that do not move but touch what moves (--anchor) are pinned. Stills get alpha from masks/STILL_mask.png where
-there are such; frames need masks (--video-masks), or the result is to be segmented next. A single view cannot tell
-depth: expect motion across it to be learned, not along it.
+whose place they were made (or frames as PNG, with --cameras and --fps). Kernels near the moving cloud are simulated,
+near the object's cloud foreground; those of the object that do not move but touch what moves (--anchor) are pinned.
+Stills get alpha from masks/STILL_mask.png where there are such; frames need masks (--video-masks), or the result is to
+be segmented next. A single view cannot tell depth: expect motion across it to be learned, not along it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from data_prep.capture.cameras.sources import Posed, fitted, from_model, read_lens_transforms
 from data_prep.capture.films.film import FILMS, FilmFrames
 from data_prep.common.command import option
-from data_prep.common.photos import Photo
+from data_prep.common.photos import Photo, list_images, open_photo, read_picture
 from data_prep.public.fields import check_name
 from data_prep.public.scene import ImportOptions, Motion, PublicObject, flattened, pinhole
 from data_prep.ready.marks import SCENE, scene_files, write_scene
@@ -62,19 +62,18 @@ def read(root: Path, options: Options) -> PublicObject:
             "every object: take it from there."
         )
     view, paths = _films(root / "videos", posed, options)
-    films = [FilmFrames(path) for path in paths]
-    rates = {float(film.facts.rate) for film in films}
-    if len(rates) > 1 and options.fps is None:
-        raise DataError(f"{root / 'videos'}: films have different rates {sorted(rates)}. State --fps, or take one out.")
-    shortest = min(len(film.facts) for film in films)
-    motions = tuple(_motion(i, film, view, posed[view], options) for i, film in enumerate(films))
+    found = [_motion(i, path, view, posed[view], options) for i, path in enumerate(paths)]
+    motions, rates = tuple(motion for motion, _ in found), {rate for _, rate in found}
+    if options.fps is None and (len(rates) > 1 or None in rates):
+        raise ConfigError(f"--fps: {root / 'videos'} does not say one rate ({', '.join(map(str, rates))}); state it.")
+    shortest = min(motion.count for motion in motions)
     stills = []
     for name, shot in posed.items():
         mask, (camera, straight) = root / "masks" / f"{name}_mask.png", pinhole(name, shot)
         path = shot.photo.path
         stills.append((camera, flattened(path, straight, camera.size, mask if mask.is_file() else None)))
     return PublicObject(
-        root, options.name or root.absolute().name, options.fps or rates.pop(),
+        root, options.name or root.absolute().name, options.fps or rates.pop() or 0.0,
         options.train_frames or min(TRAIN_FRAMES, shortest), motions, options.heldout, stills=tuple(stills),
         scene=partial(write_scene, root=root, near=options.near, anchor=options.anchor), files={**files, **parts},
     )  # fmt: skip
@@ -85,6 +84,8 @@ def _films(folder: Path, posed: Mapping[str, Posed], options: Options) -> tuple[
     if options.cameras is not None and options.cameras not in posed:
         raise ConfigError(f"--cameras {options.cameras}: no such still; there are {sorted(posed, key=natural)[:12]}.")
     found = [p for p in folder.iterdir() if p.suffix.lower() in FILMS] if folder.is_dir() else []
+    if folder.is_dir() and not found and options.cameras is not None:
+        return options.cameras, [folder]  # of frames
     # The longest name wins: frame_1 is also the beginning of frame_11.
     of = {film: max((s for s in posed if film.stem.startswith(s)), key=len, default=options.cameras) for film in found}
     views = {view for view in of.values() if view is not None}
@@ -98,11 +99,19 @@ def _films(folder: Path, posed: Mapping[str, Posed], options: Options) -> tuple[
     return view, chosen
 
 
-def _motion(number: int, film: FilmFrames, name: str, shot: Posed, options: Options) -> Motion:
-    """A film as a sequence of the camera that stood where a still was taken."""
-    photo = Photo(film.facts.path.name, film.facts.path, *film.facts.size, None)
+def _motion(number: int, path: Path, name: str, shot: Posed, options: Options) -> tuple[Motion, float | None]:
+    """A film, or a folder of frames, as a sequence of the camera that stood where a still was taken; its rate."""
+    rate: float | None = None
+    if path.is_dir():
+        paths = list_images(path)
+        photo, reads = open_photo(paths[0], name), [partial(read_picture, p) for p in paths]
+        names = [f"{p.stem}.png" for p in paths]
+    else:
+        film = FilmFrames(path)
+        photo, rate = Photo(path.name, path, *film.facts.size, None), float(film.facts.rate)
+        paths, reads = [path] * len(film.facts), [partial(film.rgba, i) for i in range(len(film.facts))]
+        names = [f"{i:04d}.png" for i in range(len(film.facts))]
     view, straight = pinhole(name, replace(shot, photo=photo, camera=fitted(shot.camera, photo)[1]))
-    folder = options.video_masks
-    masks = [folder / f"{i:04d}.png" if folder is not None else None for i in range(len(film.facts))]
-    frames = [flattened(photo.path, straight, view.size, mask, partial(film.rgba, i)) for i, mask in enumerate(masks)]
-    return Motion(f"seq_{number:03d}", photo.path, (view,), {name: tuple(frames)})
+    masks = [options.video_masks / n if options.video_masks is not None else None for n in names]
+    frames = [flattened(p, straight, view.size, m, r) for p, m, r in zip(paths, masks, reads, strict=True)]
+    return Motion(f"seq_{number:03d}", path, (view,), {name: tuple(frames)}), rate

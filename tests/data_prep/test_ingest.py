@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from data_prep.capture.films.film import probe
+from data_prep.capture.films.film import FilmFrames, probe
 from data_prep.capture.films.sync import measure
 from data_prep.capture.films.takes import find_takes, offset_seconds
 from data_prep.ingest import IngestOptions, ingest, main
@@ -67,19 +67,30 @@ class Camera:
         value = np.clip(255 * linear ** (1 / 2.2) + noise, 0, 255).astype(np.uint8)
         return np.stack([value, value, value // 2], axis=-1)
 
-    def write(self, path: Path, *, stamps: list[int] | None = None) -> Path:
-        """Encodes the film; ``stamps`` are time stamps in frames where they are not 0, 1, 2 …"""
+    def write(
+        self,
+        path: Path,
+        *,
+        stamps: list[int] | None = None,
+        ticks: int = 1,
+        aspect: Fraction | None = None,
+        keys: int = 0,
+    ) -> Path:
+        """Encodes the film; ``stamps`` are time stamps in parts of frames where they are not 0, 1, 2 …"""
         path.parent.mkdir(parents=True, exist_ok=True)
         with av.open(str(path), "w") as film:
             video = film.add_stream("libx264", rate=self.rate)
             video.width, video.height, video.pix_fmt = *SIZE, "yuv420p"
-            video.options = {"crf": self.crf, "preset": "veryfast"}
+            video.options = {"crf": self.crf, "preset": "veryfast", **({"g": str(keys), "bf": "0"} if keys else {})}
+            video.codec_context.time_base = 1 / (self.rate * ticks)
+            if aspect:
+                video.codec_context.sample_aspect_ratio = aspect
             if self.turned:
                 video.set_display_rotation(self.turned)
             track = film.add_stream(self.audio, rate=RATE, layout="mono") if self.audio else None
             for k in range(self.frames):
                 frame = av.VideoFrame.from_ndarray(self.picture(k), format="rgb24")
-                frame.pts, frame.time_base = (stamps[k] if stamps else k), 1 / self.rate
+                frame.pts, frame.time_base = (stamps[k] if stamps else k * ticks), 1 / (self.rate * ticks)
                 film.mux(video.encode(frame))
             film.mux(video.encode())
             if track is not None:
@@ -278,6 +289,43 @@ def test_turned_cameras_come_out_upright(tmp_path: Path) -> None:
     assert found["cameras"]["cam_0"]["size"] == list(SIZE[::-1])
     written = cv2.cvtColor(cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_0/0003.png")), cv2.COLOR_BGR2RGB)
     assert np.abs(written.astype(int) - np.rot90(camera.picture(3))).mean() < 6
+
+
+def test_pixels_become_square(tmp_path: Path) -> None:
+    """An anamorphic film: 96 samples of 4:3 are 128 pixels."""
+    path = Camera(0.1, Fraction(25), 6, audio=None).write(tmp_path / "in" / "a.mp4", aspect=Fraction(4, 3))
+    assert probe(path).size == (128, 64)
+    ingested(tmp_path / "in", tmp_path / "out")
+    assert cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_0/0003.png")).shape == (64, 128, 3)
+
+
+def test_frames_before_the_first_key_frame_are_left_out(tmp_path: Path) -> None:
+    whole = Camera(0.1, Fraction(25), 40, audio=None).write(tmp_path / "whole.mp4", keys=12)
+    (tmp_path / "in").mkdir()
+    with av.open(str(whole)) as source, av.open(str(tmp_path / "in" / "cut.mp4"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in [p for p in source.demux(video=0) if p.size][5:]:
+            packet.stream = stream
+            target.mux(packet)
+    found = ingested(tmp_path / "in", tmp_path / "out")
+    assert found["frames"] == 28 and any("between key frames" in note for note in found["notes"])
+
+
+def test_jitter_is_no_other_rate_and_slow_motion_is(tmp_path: Path) -> None:
+    """A phone's time stamps are some milliseconds off; a film whose rate changes is read by ingest alone."""
+    rng = np.random.default_rng(1)
+    for name in ("a", "b"):
+        stamps = [round(100 * (k + rng.uniform(-0.15, 0.15))) for k in range(30)]
+        Camera(0.0, Fraction(30), 30, audio=None).write(tmp_path / "in" / f"{name}.mp4", stamps=stamps, ticks=100)
+        assert not probe(tmp_path / "in" / f"{name}.mp4").variable
+    found = ingested(tmp_path / "in", tmp_path / "out", sync="offsets", offsets={"b": "0"})
+    assert found["fps"] == pytest.approx(30, rel=2e-3) and all(
+        c["residual_frames"]["largest"] < 0.4 for c in found["cameras"].values()
+    )
+    slow = [*range(0, 40, 4), *range(40, 60), *range(60, 100, 4)]
+    Camera(0.0, Fraction(120), len(slow), audio=None).write(tmp_path / "slow.mp4", stamps=slow)
+    with pytest.raises(DataError, match=r"slow\.mp4: its rate varies.*ingest"):
+        FilmFrames(tmp_path / "slow.mp4")
 
 
 FAULTS: dict[str, Callable[[bytes], bytes]] = {

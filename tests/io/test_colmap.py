@@ -64,6 +64,18 @@ def test_the_model_is_found_where_colmap_puts_it(tmp_path: Path) -> None:
         find_colmap(tmp_path / "nothing")
 
 
+@pytest.mark.parametrize("form", WRITERS)
+def test_of_several_models_the_largest_counts_and_names_stay_as_they_are(form: str, tmp_path: Path) -> None:
+    cameras, images, points = colmap_files.small_model()
+    few = dict(list(images.items())[:1])
+    many = {n: (f"left  {n}\u00a0a.png", *i[1:]) for n, i in images.items()}
+    for number, part in enumerate((few, many)):
+        WRITERS[form](tmp_path / "sparse" / str(number), cameras, part, points)
+    assert find_colmap(tmp_path) == tmp_path / "sparse" / "1"
+    found = {image.name for image in read_colmap(find_colmap(tmp_path)).images}
+    assert found == {image[0] for image in many.values()}
+
+
 # What is wrong, in a text model: file, what is replaced by what, and what the message must say.
 FAULTS = {
     "model": ("cameras", "PINHOLE 64", "EQUIRECTANGULAR 64", "'model'"),

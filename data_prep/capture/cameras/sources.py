@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.common.command import Options, option
-from data_prep.common.photos import Photo, list_images, open_photo
+from data_prep.common.photos import SUFFIXES, Photo, list_images, open_photo, unread_in
 from data_prep.common.stage import MANIFEST, read_manifest
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import (
@@ -82,6 +82,8 @@ class Material:
     sequences: dict[Path, tuple[str, ...]]  # the folders of sequences with the names of their cameras
     fps: float | None  # frames per second of the sequences
     inputs: dict[str, Path]  # all files that are read, by the names that the manifest gives them
+    without_pose: tuple[str, ...] = ()  # photos beside those whose poses are taken over
+    note: str = ""  # about pictures that are not read
 
     @staticmethod
     def of(sources: Sources) -> Material:
@@ -95,7 +97,13 @@ class Material:
         for folder, cameras in folders.items():
             for camera in cameras:
                 inputs.update({f"{folder.name}/{camera}/{p.name}": p for p in list_images(folder / camera)})
-        return Material(stills, posed, folders, fps, inputs)
+        without: tuple[str, ...] = ()
+        if sources.images is not None and posed is not None:
+            known, every = {shot.photo.path for shot in posed[0]}, sources.images.rglob("*")
+            left = (p for p in every if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and p not in known)
+            without = tuple(sorted((p.relative_to(sources.images).as_posix() for p in left), key=natural))
+        note = unread_in(sources.images) if sources.images is not None else ""
+        return Material(stills, posed, folders, fps, inputs, without, note)
 
 
 def _taken_over(sources: Sources) -> tuple[tuple[list[Posed], PointTable] | None, dict[str, Path]]:

@@ -115,15 +115,31 @@ class ColmapModel:
 
 
 def find_colmap(folder: Path) -> Path:
-    """The folder of a sparse model: ``folder`` or ``sparse/0``, ``sparse`` or ``0`` in it.
+    """The folder of a sparse model: ``folder``, else of ``sparse`` and numbered folders the one with most images.
+
+    COLMAP writes ``sparse/0``, ``sparse/1`` and so on where it could not join all photos.
 
     Raises:
         DataError: none of these folders contains a model.
     """
-    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
-        if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return place
-    raise DataError(f"{folder}: no COLMAP model here (cameras.bin or cameras.txt, also not in sparse/0).")
+    inner = [p for parent in (folder / "sparse", folder) if parent.is_dir() for p in sorted(parent.iterdir())]
+    places = [folder, folder / "sparse", *(p for p in inner if p.name.isdecimal())]
+    models = [p for p in places if any((p / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))]
+    if not models:
+        raise DataError(f"{folder}: no COLMAP model here (cameras.bin or cameras.txt, also not in sparse/0).")
+    return folder if models[0] == folder else max(models, key=_image_count)
+
+
+def _image_count(folder: Path) -> int:
+    """Number of images that a model states; 0 where that cannot be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with (folder / "images.bin").open("rb") as file:
+                return int.from_bytes(file.read(8), "little")
+        lines = (folder / "images.txt").read_bytes().splitlines()
+    except OSError:
+        return 0
+    return sum(bool(line.strip()) and not line.startswith(b"#") for line in lines)
 
 
 def colmap_files(folder: Path) -> dict[str, Path]:
@@ -292,7 +308,8 @@ def _cameras_binary(path: Path) -> Iterator[_CameraRow]:
 
 
 def _cameras_text(path: Path) -> Iterator[_CameraRow]:
-    for where, words in _lines(path):
+    for where, line in _lines(path):
+        words = line.split()
         if not words:
             continue
         model = words[1] if len(words) > 1 else ""
@@ -323,15 +340,17 @@ def _images_binary(path: Path) -> Iterator[_ImageRow]:
 
 def _images_text(path: Path) -> Iterator[_ImageRow]:
     lines = _lines(path)
-    for where, words in lines:
+    for where, line in lines:
+        words = line.split(maxsplit=9)  # a name may hold spaces of all kinds
         if not words:
             continue
         if len(words) < 10:
             raise DataError(f"{where}: expected ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {len(words)} words.")
         number, camera = (_whole(where, words[i]) for i in (0, 8))
-        pose, name = _numbers(where, words[1:8]), " ".join(words[9:])
+        pose, name = _numbers(where, words[1:8]), words[9]
         # Its keypoints are on the next line, which may be empty, or missing at the end of the file.
-        below, keypoints = next(lines, (where, []))
+        below, text = next(lines, (where, ""))
+        keypoints = text.split()
         if len(keypoints) % 3:
             raise DataError(f"{below}: keypoints: expected triples X Y POINT3D_ID, got {len(keypoints)} words.")
         table = _numbers(below, keypoints).reshape(-1, 3)
@@ -349,7 +368,8 @@ def _points_binary(path: Path) -> Iterator[tuple[tuple, int]]:
 
 
 def _points_text(path: Path) -> Iterator[tuple[np.ndarray, int]]:
-    for where, words in _lines(path):
+    for where, line in _lines(path):
+        words = line.split()
         track, odd = divmod(len(words) - _POINT_COLUMNS, 2)
         if words and (track < 0 or odd):
             raise DataError(f"{where}: expected ID X Y Z R G B ERROR and pairs of a track, got {len(words)} words.")
@@ -357,13 +377,13 @@ def _points_text(path: Path) -> Iterator[tuple[np.ndarray, int]]:
             yield _numbers(where, words)[:_POINT_COLUMNS], track
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Place and words of every line except comments; empty lines are kept, as ``images.txt`` needs them."""
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Place and text of every line except comments; empty lines are kept, as ``images.txt`` needs them."""
     for number, raw in enumerate(_contents(path).split(b"\n"), 1):
         where = f"{path}: line {number}"
         line = _decoded(raw, where).strip()
         if not line.startswith("#"):
-            yield where, line.split()
+            yield where, line
 
 
 def _contents(path: Path) -> bytes:

@@ -1,0 +1,105 @@
+"""One reader of pictures and masks for all stages: stored pixels, every depth, every way to write a mask."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_prep.capture.cameras.sources import fitted
+from data_prep.common.photos import open_photo, read_mask, read_picture, unread_in
+from gausim.core import DataError
+from gausim.io.colmap import ColmapCamera
+from gausim.io.pixels import exif_turned
+
+RGBA = np.random.default_rng(0).integers(0, 256, (6, 8, 4)).astype(np.uint8)
+DISC = np.hypot(*np.mgrid[-8:8, -12:12]) < 6
+
+
+def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", ["rgb.png", "rgba.png", "rgb.tif"])
+def test_pixels_are_those_that_are_stored(name: str, orientation: int, tmp_path: Path) -> None:
+    pixels = RGBA if name == "rgba.png" else RGBA[..., :3]
+    path = with_orientation(tmp_path / name, pixels, orientation)
+    photo = open_photo(path, name)
+    assert (photo.width, photo.height) == (8, 6)
+    np.testing.assert_array_equal(photo.read()[..., : pixels.shape[2]], pixels)
+    upright = Image.open(path)
+    upright = upright if name == "rgb.tif" else __import__("PIL.ImageOps").ImageOps.exif_transpose(upright)
+    np.testing.assert_array_equal(exif_turned(pixels, orientation), np.asarray(upright))
+
+
+@pytest.mark.parametrize("name", ["rgb.png", "rgb.tif"])
+def test_a_picture_is_turned_where_its_lens_was_calibrated_for_that(name: str, tmp_path: Path) -> None:
+    photo = open_photo(with_orientation(tmp_path / name, RGBA[..., :3], 6), name)
+    stored, _ = fitted(ColmapCamera("PINHOLE", 16, 12, np.array([9.0, 9, 8, 6])), photo)
+    turned, camera = fitted(ColmapCamera("PINHOLE", 12, 16, np.array([9.0, 9, 6, 8])), photo)
+    np.testing.assert_array_equal(stored.read()[..., :3], RGBA[..., :3])
+    np.testing.assert_array_equal(turned.read()[..., :3], np.rot90(RGBA[..., :3], -1))
+    assert (camera.width, camera.height) == (turned.width, turned.height) == (6, 8)
+    with pytest.raises(DataError, match="another shape"):
+        fitted(ColmapCamera("PINHOLE", 12, 40, np.array([9.0, 9, 6, 20])), photo)
+
+
+def test_every_depth_keeps_its_alpha(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "deep.png"), RGBA[..., [2, 1, 0, 3]].astype(np.uint16) * 257)
+    Image.fromarray(RGBA[..., [0, 3]], "LA").save(tmp_path / "grey.png")
+    Image.fromarray(RGBA[..., 0]).save(tmp_path / "plain.png")
+    np.testing.assert_array_equal(read_picture(tmp_path / "deep.png"), RGBA)
+    np.testing.assert_array_equal(read_picture(tmp_path / "grey.png"), RGBA[..., [0, 0, 0, 3]])
+    np.testing.assert_array_equal(read_picture(tmp_path / "plain.png")[..., 3], 255)
+    (tmp_path / "a.HEIC").touch()
+    assert "1 files (.HEIC)" in unread_in(tmp_path)
+
+
+def write_masks(folder: Path) -> dict[str, Path]:
+    """The disc in all the ways in which programs write masks."""
+    grey, paths = DISC.astype(np.uint8), {}
+    palette = Image.fromarray(grey, "P")
+    palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    white_first = Image.fromarray(1 - grey, "P")
+    white_first.putpalette([255, 255, 255, 0, 0, 0])
+    opaque = np.dstack([255 * grey] * 3 + [np.full_like(grey, 255)])
+    alpha = np.dstack([np.full((*DISC.shape, 3), 90, np.uint8), 255 * grey])
+    for name, image in {
+        "values.png": Image.fromarray(255 * grey), "labels.png": Image.fromarray(grey), "palette.png": palette,
+        "greys.png": white_first, "bit.png": Image.fromarray(DISC), "opaque.png": Image.fromarray(opaque),
+        "alpha.png": Image.fromarray(alpha), "ringing.jpg": Image.fromarray(255 * grey),
+        "deep.png": Image.fromarray(65535 * DISC.astype(np.uint16)),
+        "deep labels.png": Image.fromarray(DISC.astype(np.uint16)),
+    }.items():  # fmt: skip
+        image.save(paths.setdefault(name, folder / name))
+    return paths
+
+
+def test_every_way_to_write_a_mask_is_read(tmp_path: Path) -> None:
+    for name, path in write_masks(tmp_path).items():
+        mask = read_mask(path, (24, 16), "a")
+        wrong = np.abs(mask.astype(int) - 255 * DISC)
+        assert mask.dtype == np.uint8 and (
+            wrong.max() == 0 or (name == "ringing.jpg" and (wrong > 40).mean() < 0.05)
+        ), name
+
+
+def test_masks_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.png"
+    for values, told in (
+        (7 * DISC, "labels of several"),
+        (100 * DISC, "half transparent"),
+        (255 * DISC[:4], "is 24x4"),
+    ):
+        cv2.imwrite(str(path), values.astype(np.uint8))
+        with pytest.raises(DataError, match=rf"m\.png: .*{told}"):
+            read_mask(path, (24, 16), "a")
+    cv2.imwrite(str(path), np.zeros(DISC.shape, np.uint8))
+    assert not read_mask(path, (24, 16), "a").any()  # the object is out of the picture
