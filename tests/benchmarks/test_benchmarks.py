@@ -14,7 +14,7 @@ from helpers import toy_object
 from helpers.simulators import gausim
 
 from benchmarks import __main__ as command
-from benchmarks import cluster, data, interact, render, step, train
+from benchmarks import bodies, cluster, data, interact, render, step, train
 from benchmarks.harness import Options, Row, cloud, medians, peak_saved_bytes, simulator_of
 from gausim.core import GaussianScene
 from gausim.data.datamodule import ReadyDataModule
@@ -113,3 +113,13 @@ def test_the_command_prints_one_object(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert command.main(["cluster", "--json", "--quick", "--rounds", "1"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {"machine", "rows"} and document["rows"][0]["value"] == 3.0
+
+
+def test_errors_of_fits_are_drawn_by_the_bodies_of_their_base(tmp_path: Path, capsys) -> None:
+    for number, (count, error) in enumerate(((0, 0.9), (10, 0.5), (10, 0.7))):
+        (tmp_path / str(number)).mkdir()
+        facts = {"seen": 6, "pretrained": count, "all": {"error": [0.1, 0.2, error]}}
+        (tmp_path / str(number) / bodies.FILE).write_text(json.dumps(facts))
+    assert bodies.main([str(tmp_path), str(tmp_path / "curve.png")]) == 0
+    assert "6 frames seen: 0.900 with 0 bodies, 0.600 with 10 bodies" in capsys.readouterr().out
+    assert (tmp_path / "curve.png").stat().st_size > 1000

@@ -12,7 +12,8 @@ import torch
 from helpers.corpus import FRAMES, SEQUENCES, write_corpus
 from msgspec.structs import replace
 
-from gausim.cli import evaluate, report, simulate, train
+from benchmarks import bodies
+from gausim.cli import evaluate, simulate, train
 from gausim.compose.build import build
 from gausim.compose.config import compose
 from gausim.compose.unfilmed import EvenMaterial, open_scene
@@ -167,11 +168,11 @@ def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, base: P
     assert "Rank correlation of fitted and true stiffness: " in capsys.readouterr().out
     (body,) = json.loads((fit / "evaluation" / "corpus.json").read_text())["bodies"]
     assert body["name"] == "beam2" and body["period"] == pytest.approx(14 / 24) and abs(body["within"]) <= 1
-    assert report.main([str(tmp_path), "--bodies", str(tmp_path / "curve.png")]) == 0
+    assert bodies.main([str(tmp_path), str(tmp_path / "curve.png")]) == 0
     assert re.search(r"6 frames seen: \S+ with 2 bodies\n", capsys.readouterr().out)
     assert (tmp_path / "curve.png").stat().st_size > 1000
     with pytest.raises(GausSimError, match="no fit to bodies of a corpus"):
-        report.main([str(corpus), "--bodies", str(tmp_path / "curve.png")])
+        bodies.main([str(corpus), str(tmp_path / "curve.png")])
     with pytest.raises(GausSimError, match="measured as a whole"):
         evaluate.main([str(fit), "--sequences", "seq_000"])
 

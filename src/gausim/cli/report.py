@@ -22,8 +22,6 @@ def main(argv: list[str]) -> int:
         return _write_page(arguments.page)
     if not arguments.dirs:
         raise ConfigError("DIR: expected run directories, sweeps, or folders of them, got none.")
-    if arguments.bodies:
-        return _draw_bodies(arguments.dirs, arguments.bodies)
     if arguments.results or arguments.record:
         return _write_results(arguments)
     from gausim.report.write import summary_line, write_report
@@ -50,18 +48,6 @@ def _write_page(target: Path) -> int:
 
     write_durably(target, page(target.with_suffix("")).encode())
     print(f"page: {target.resolve().as_uri()}")
-    return 0
-
-
-def _draw_bodies(dirs: list[Path], target: Path) -> int:
-    """Draws the errors of fits to bodies held out of a corpus, and prints them."""
-    from gausim.report.bodies import bodies_figure, fitted_errors
-
-    errors = fitted_errors(dirs)
-    bodies_figure(errors, target)
-    for frames, line in errors.items():
-        print(f"{frames} frames seen: " + ", ".join(f"{error:.3f} with {n} bodies" for n, error in line.items()))
-    print(f"figure: {target.resolve().as_uri()}")
     return 0
 
 
@@ -95,11 +81,8 @@ def _next(report: Report) -> list[list[object]]:
         trained = [run for run in report.study.runs if run.status == NOT_EVALUATED]
         return [["evaluate", run.path] for run in trained[:3]]
     best = report.openings[0]
-    return [
-        ["view", best.run.path],
-        push(best.run.path, best.name if len(best.run.objects) > 1 else None),
-        list(OWN_OBJECT),
-    ]
+    name = best.name if len(best.run.objects) > 1 else None
+    return [["view", best.run.path], push(best.run.path, name), list(OWN_OBJECT)]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -115,8 +98,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--results", metavar="OUT", type=Path, help="write only results.md and tables.tex, to this folder: all "
         "figures with commit, command, hardware and cost")  # fmt: skip
     add("--record", metavar="FILE.json", type=Path, help="instead write these figures as a small record for pages")
-    add("--bodies", metavar="FILE.png", type=Path, help="instead draw how far off fits to bodies of a corpus are "
-        "(experiment=pretrain_fit), against the number of bodies that their base was trained on")  # fmt: skip
     add("--page", metavar="FILE.md", type=Path, help="make FILE.md from FILE/page.md and the records FILE/*.json")
     add("--verbose", action="store_true", help="list the files that are written")
     add("--no-pictures", action="store_true", help="leave figures and videos out (a small page, in a second)")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
-from gausim.results.pivot import Column, Grid, Pivot, joined, markdown_rows, markdown_table
+from gausim.results.pivot import Column, Grid, Pivot, joined, markdown_table
 from gausim.results.summary import AHEAD, ERROR_3D, MOTION_ENERGY
-from gausim.results.table import SPLIT_TITLES, VIEW_TITLES, ObjectInfo, Results
+from gausim.results.table import SPLIT_TITLES, VIEW_TITLES, Results
 
 LEGEND = (
     "Mean, in brackets standard deviation over sequences; `÷ static` is the ratio to the static prediction (below 1 is "
@@ -29,8 +30,13 @@ def markdown(results: Results) -> str:
         parts += [f"{len(info.sequences)} sequences of {max(info.frames, default=0)} frames at {info.fps:g} fps.", ""]
         for grid in object_grids(pivot, name):
             parts += [f"### {grid.title}", "", markdown_table(grid), ""]
+        color = info.mean_color or (0.0, 0.0, 0.0)
+        parts += [
+            f"Contrast: mean foreground colour ({', '.join(f'{c:.2f}' for c in color)}), its norm "
+            f"{math.hypot(*color):.2f}; largest l2 of a pixel {info.max_l2:.2f}.\n"
+        ]
         parts += [f"* {row}: {note}\n" for row in info.methods for note in info.notes.get(row, [])]
-    return "\n".join([*parts, *_contrast(results.objects)])
+    return "\n".join(parts)
 
 
 def object_grids(pivot: Pivot, name: str) -> list[Grid]:
@@ -61,13 +67,3 @@ def _splits(pivot: Pivot, name: str, views: str) -> Grid | None:
             lines = tuple(replace(line, label=f"{frames} | {line.label}") for line in grid.lines)
             grids.append(replace(grid, lines=lines))
     return joined(grids)
-
-
-def _contrast(objects: dict[str, ObjectInfo]) -> list[str]:
-    """The paper's table of colour contrast, on which absolute errors of objects depend."""
-    rows = [["object", "mean foreground colour", "its norm", "largest l2 of a pixel"], ["---"] * 4]
-    for name, info in objects.items():
-        color = info.mean_color or (0.0, 0.0, 0.0)
-        norm = sum(c * c for c in color) ** 0.5
-        rows.append([name, f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{info.max_l2:.2f}"])
-    return ["## Colour contrast", "", "Foreground against black.", "", markdown_rows(rows), ""]

@@ -1,8 +1,12 @@
-"""Errors of fits to bodies held out of a corpus, against the number of bodies that the network was trained on."""
+"""Errors of fits to bodies held out of a corpus, against the number of bodies that the network was trained on.
+
+``python -m benchmarks.bodies DIR FILE.png`` draws the evaluated runs of ``experiment=pretrain_fit`` below DIR.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -58,3 +62,17 @@ def bodies_figure(errors: Mapping[int, Mapping[int, float]], path: Path) -> None
     axes.set(xlabel="bodies pretrained on", ylabel="3D error of unseen frames ÷ static", ylim=(0, None))
     axes.legend(fontsize=7)
     save_figure(figure, path)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draws and prints the errors of the runs below a folder."""
+    folder, target = map(Path, argv)
+    errors = fitted_errors([folder])
+    bodies_figure(errors, target)
+    for frames, line in errors.items():
+        print(f"{frames} frames seen: " + ", ".join(f"{error:.3f} with {n} bodies" for n, error in line.items()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
