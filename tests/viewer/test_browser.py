@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 from viser.transforms import SO3
 
-from gausim.cli.view_subject import playable_run, subject_of
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Kernels
@@ -156,18 +154,6 @@ def test_a_pin_goes_where_the_mouse_goes(make_interaction: Callable[..., Interac
 @pytest.mark.slow
 def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(keep=None), sessions=tmp_path), tmp_path) as (viewer, page):
-        play(viewer, page)
-
-
-@pytest.mark.slow
-def test_trained_run_is_dragged_reset_and_replayed(tmp_path: Path) -> None:
-    run_dir, data = os.environ.get("GAUSIM_TEST_RUN"), os.environ.get("GAUSIM_TEST_RUN_DATA")
-    if not run_dir:
-        pytest.skip("GAUSIM_TEST_RUN is not set: it names a trained run (GAUSIM_TEST_RUN_DATA: its data set)")
-    from gausim.compose.build import load_run
-
-    made = playable_run(load_run(run_dir, data={"root": data} if data else None), keep=None)
-    with opened(subject_of(made, title="a run", beside=None, up="z", sessions=tmp_path), tmp_path) as (viewer, page):
         play(viewer, page)
 
 

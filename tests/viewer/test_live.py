@@ -136,15 +136,6 @@ def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(one: L
     one.join(5)
 
 
-def test_too_many_commands_let_everything_go(one: Live) -> None:
-    one.act(Force(Whole(), (1.0, 0, 0), 1.0))
-    for _ in range(5000):
-        one.do(lambda: None)
-    assert one._commands.qsize() <= 1024
-    one._take_commands(0.0)
-    assert not one.interaction.acting and "let go" in one.message
-
-
 def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interaction]) -> None:
     watched = threading.Event()
     one = Live(make_interaction(), lambda _: None, watched=watched.is_set)

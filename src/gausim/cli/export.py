@@ -54,12 +54,8 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    width = max(map(len, FORMATS))
-    rows = []
-    for name, form in FORMATS.items():
-        rows += [f"  {name:<{width}}  keeps  {form.keeps}", f"  {'':<{width}}  loses  {form.loses}"]
-        rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
-    parser = command_parser("export", epilog="formats:\n" + "\n".join(rows))
+    rows = [f"  {name:<12} {form.keeps}; loses {form.loses}" for name, form in FORMATS.items()]
+    parser = command_parser("export", epilog="formats and what they keep:\n" + "\n".join(rows))
     add = parser.add_argument
     add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); or a folder of "
         "name_0001.ply, ...")  # fmt: skip
@@ -226,61 +222,21 @@ def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
 
 
 class Format(NamedTuple):
-    """A file format: suffix (empty for a folder), content that it keeps and loses, and readers."""
+    """A file format: suffix (empty for a folder), content that it keeps and loses."""
 
     suffix: str
     keeps: str
     loses: str
-    reader: str = ""
 
 
 FORMATS = {
-    "safetensors": Format(
-        ".safetensors",
-        "every number of the trajectory, bit for bit: positions, deformation gradients and rotations per unit",
-        "the rest scene (keep SCENE.ply beside it)",
-        "gausim (--scene SCENE.ply), any safetensors reader",
-    ),
-    "ply": Format(
-        "",
-        "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
-        "spherical harmonics, masks of the first frame",
-        "units of the kernels, deformation gradients",
-        "gausim, SuperSplat, every 3DGS viewer",
-    ),
-    "motion": Format(
-        ".motion.glb",
-        "the rest scene and its masks; of every unit and frame centre and deformation gradient as 12 half floats, a "
-        "hundredth of the size of PLY files",
-        "digits (errors below a thousandth of the diagonal; spherical harmonics have 8 bits); rotations become those "
-        "of the deformation gradients",
-        "the page of --format html; the rest scene by every reader of glTF's KHR_gaussian_splatting",
-    ),
-    "html": Format(
-        ".html",
-        "as motion, in one page that plays in a browser without a network: turned spherical harmonics, time bar, orbit",
-        "as motion",
-        "every browser with WebGL 2",
-    ),
-    "gltf": Format(
-        "",
-        "one glTF (GLB with KHR_gaussian_splatting) per frame, name_0001.glb: covariances as axes and lengths, turned "
-        "spherical harmonics, float32",
-        "masks, units, deformation gradients, frame rate",
-        "PlayCanvas, Babylon.js, three.js, Cesium",
-    ),
-    "usd": Format(
-        ".usdc",
-        "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
-        "spherical harmonics, float32",
-        "masks, units, deformation gradients",
-        "OpenUSD 26.3 or newer",
-    ),
-    "viser": Format(
-        ".viser",
-        "positions, covariances (float16), one colour per kernel and frame",
-        "spherical harmonics, masks, units",
-    ),
+    "safetensors": Format(".safetensors", "every number of the trajectory, bit for bit", "the rest scene"),
+    "ply": Format("", "a 3DGS PLY per frame, with turned spherical harmonics and masks", "units and their deformation"),
+    "motion": Format(".motion.glb", "rest scene, and 12 half floats per unit and frame", "digits beyond a thousandth"),
+    "html": Format(".html", "as motion, in one page that plays in a browser without a network", "as motion"),
+    "gltf": Format("", "a GLB per frame (KHR_gaussian_splatting)", "masks, units, frame rate"),
+    "usd": Format(".usdc", "a ParticleField3DGaussianSplat with time samples", "masks, units"),
+    "viser": Format(".viser", "positions, covariances (float16), base colours", "spherical harmonics, masks, units"),
     "mp4": Format(".mp4", "pictures of one camera", "everything else"),
-    "gif": Format(".gif", "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"),
+    "gif": Format(".gif", "pictures of one camera, 256 colours", "everything else"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,7 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
             record = item.data.record(sequence_of(item, name).name)
             trajectory = predict(record, arguments.frames)
             error_figure(curves, folder / name / "errors.png", sequence=name)
-            write_trajectory(run, item, name, trajectory, folder / name)
+            _write_trajectory(run, item, name, trajectory, folder / name)
             for view in views:
                 _write_view(run, item, record, trajectory, view, arguments, folder / name)
                 advance(f"{name} {view}")
@@ -107,9 +107,7 @@ def _write_view(
         for number, image in enumerate(prediction):
             yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)
 
-    write_video(folder / f"{view}.mp4", compared(), fps)
-    if arguments.gif:
-        write_gif(folder / f"{view}.gif", compared(), fps)
+    _write_videos(folder / view, compared, fps, arguments)
     slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
     contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
 
@@ -138,14 +136,14 @@ def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -
     arrows: list[list[Arrow]] = []
     trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
     folder = out / item.data.name / (Path(arguments.session).stem if arguments.session else "forces")
-    write_trajectory(run, item, session.made_with.initial, trajectory, folder)
+    _write_trajectory(run, item, session.made_with.initial, trajectory, folder)
     save_session(session, folder / "session.json")
     for view in views:
         cameras = _sharp(item.data.sequences[0].cameras_of([view]))
-        write_film(run.renderer, interaction.scene, trajectory, arrows, cameras, arguments, folder)
+        _write_film(run.renderer, interaction.scene, trajectory, arrows, cameras, arguments, folder)
     _list(folder, arguments)
     replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
-    end(told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
+    end(_sentences(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
     return 0
 
 
@@ -179,9 +177,9 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
         scene.means[scene.foreground], azimuths=[arguments.azimuth], up=arguments.up, size=SIZE
     )  # fmt: skip
     renderer = instantiate(compose(["render=auto"]).render)
-    write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
+    _write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
     _list(folder, arguments)
-    end(told(interaction, trajectory), "videos", folder)
+    end(_sentences(interaction, trajectory), "videos", folder)
     return 0
 
 
@@ -225,13 +223,12 @@ def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Na
     return replace(found, steps=steps, entries=tuple(e for e in found.entries if e.at <= steps))
 
 
-def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
-    """Writes ``trajectory.safetensors`` of an object that started from a sequence's initial state."""
+def _write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
     facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
     save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
 
 
-def write_film(
+def _write_film(
     renderer: Renderer,
     scene: GaussianScene,
     trajectory: Trajectory,
@@ -253,14 +250,20 @@ def write_film(
             text = f"{title}   {number}/{len(images) - 1}   {acting}"
             yield np.concatenate((shown, label_bar(text, shown.shape[1])))
 
-    write_video(folder / f"{view}.mp4", pictures(), fps)
-    if arguments.gif:
-        write_gif(folder / f"{view}.gif", pictures(), fps)
+    _write_videos(folder / view, pictures, fps, arguments)
     chosen = list(range(0, len(images), max(1, len(images) // 12)))[:12]
     picture_grid(
         [images[f] for f in chosen], [f"frame {f}" for f in chosen], folder / f"{view}_sheet.png", title=title,
         columns=6,
     )  # fmt: skip
+
+
+def _write_videos(
+    stem: Path, frames: Callable[[], Iterator[np.ndarray]], fps: float, arguments: argparse.Namespace
+) -> None:
+    write_video(stem.with_name(f"{stem.name}.mp4"), frames(), fps)
+    if arguments.gif:
+        write_gif(stem.with_name(f"{stem.name}.gif"), frames(), fps)
 
 
 def _sharp(cameras: Cameras) -> Cameras:
@@ -271,7 +274,7 @@ def _sharp(cameras: Cameras) -> Cameras:
     return Cameras(cameras.viewmats, Ks, round(cameras.width * zoom), round(cameras.height * zoom), cameras.names)
 
 
-def told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
+def _sentences(interaction: Interaction, trajectory: Trajectory) -> list[str]:
     """Sentences on the largest displacement and on limits that applied."""
     scene = interaction.scene
     away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal

@@ -30,7 +30,8 @@ class Checked(Struct, frozen=True):
                 known = isinstance(hint, type | UnionType) and isinstance(value, hint) and isinstance(value, Struct)
                 converted = value if known else msgspec.convert(value, hint)
             except (msgspec.ValidationError, TypeError) as error:
-                raise ConfigError(f"field '{name}': {_lowered(error)}, got {str(value)[:80]!r}.") from error
+                what = str(error).replace("`", "").replace("array", "list")
+                raise ConfigError(f"field '{name}': {what[:1].lower()}{what[1:]}, got {str(value)[:80]!r}.") from error
             if converted is not value:  # a list converted to a tuple, or an integer to a float
                 msgspec.structs.force_setattr(self, name, converted)
 
@@ -41,21 +42,12 @@ def made(kind: type[Any], fields: Any) -> Any:
     Raises:
         ConfigError: ``fields`` is no dictionary, a field is missing or unknown, or a value is invalid.
     """
-    if not isinstance(fields, dict):
-        raise ConfigError("expected an object.")
-    names = {field.name: field.required for field in msgspec.structs.fields(kind)}
-    missing = [name for name, required in names.items() if required and name not in fields]
-    unknown = [name for name in fields if name not in names]
-    if missing or unknown:
-        raise ConfigError(f"expected the fields {', '.join(names)}; missing: {missing}, unknown: {str(unknown)[:200]}.")
-    return kind(**fields)
+    try:
+        return kind(**fields)
+    except TypeError as error:
+        raise ConfigError(f"{kind.__name__.lower()}: {str(error)[:200]}.") from error
 
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
-
-
-def _lowered(error: Exception) -> str:
-    text = str(error).replace("`", "").replace("array", "list")
-    return text[:1].lower() + text[1:]

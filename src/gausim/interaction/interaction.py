@@ -12,40 +12,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import (
-    Adjustable,
-    ConfigError,
-    DivergenceError,
-    Frame,
-    GaussianScene,
-    Handled,
-    Hands,
-    SimState,
-    Steppable,
-    Trajectory,
-    trajectory_of,
-)
+from gausim import core
+from gausim.core import ConfigError, DivergenceError, Frame, SimState, Trajectory
+from gausim.interaction import session as events
 from gausim.interaction.hands import MovedHands, hand_of
 from gausim.interaction.pushes import Push, exposure, scaled
 from gausim.interaction.selections import Selected, selection_to_json
-from gausim.interaction.session import (
-    MOST_EVENTS,
-    MOST_STEPS,
-    Entry,
-    Event,
-    Force,
-    ForceSession,
-    Gravity,
-    Hand,
-    Impulse,
-    MadeWith,
-    Material,
-    Pin,
-    Release,
-    Reset,
-    Unpin,
-    Wind,
-)
+from gausim.interaction.session import MOST_EVENTS, MOST_STEPS, Entry, Event, ForceSession, MadeWith
 from gausim.ops.deformation import determinant
 
 # In scene units / s^2 for a scene unit of one metre, the default.
@@ -73,8 +46,8 @@ class Interaction:
 
     def __init__(
         self,
-        scene: GaussianScene,
-        dynamics: Steppable,
+        scene: core.GaussianScene,
+        dynamics: core.Steppable,
         masses: Float[Tensor, " K"],
         initial: SimState,
         *,
@@ -84,7 +57,7 @@ class Interaction:
         most_force: float = MOST_FORCE,
         seed: int = 0,
         keep: int | None = 0,
-        hands: Hands | None = None,
+        hands: core.Hands | None = None,
     ) -> None:
         """Begins at ``initial`` without forces.
 
@@ -93,7 +66,7 @@ class Interaction:
             dynamics: the simulator of the scene.
             masses: masses of the kernels in the dynamics, up to a common factor.
             initial: the initial state, also after a reset.
-            made_with: header of sessions: names and hashes of scene, method and initial state.
+            made_with: names and hashes of scene, method and initial state, the header of sessions.
             units: the unit of every kernel at levels 1, 2, ... of the hierarchy; -1 for kernels of no unit.
             gravity: ratio of weight to mass [scene units / s^2].
             most_force: the largest force, and the largest sum of forces on a kernel [weights].
@@ -122,7 +95,7 @@ class Interaction:
         """Begins a new session from the initial state and discards the recorded events."""
         self.tick, self._entries = 0, list[Entry]()
         phases = random.Random(self.seed)
-        if isinstance(self._dynamics, Adjustable):
+        if isinstance(self._dynamics, core.Adjustable):
             self._dynamics.adjust(1.0, 1.0)
         self._phases = [phases.uniform(0, 2 * math.pi) for _ in _GUSTS]
         self._rest_all()
@@ -131,24 +104,20 @@ class Interaction:
 
     def reset(self) -> None:
         """Returns to the initial state without forces, wind, gravity or pins, as an event of the session."""
-        self.act(Reset())
+        self.act(events.Reset())
 
     def _rest_all(self) -> None:
-        self._limited_at: int | None = None
-        self._limited_before, self._hands = 0, cast("MovedHands | None", None)
-        if self._recorded is not None and isinstance(self._dynamics, Handled):
-            self._hands = MovedHands(self.scene, self._recorded)
-            self._stepper = self._dynamics.stepper(self._initial, self._hands.pose)
-        else:
-            self._stepper = self._dynamics.stepper(self._initial)
+        self.frame_number, self._limited_before, self._limited_at = 0, 0, cast("int | None", None)
+        moves = self._recorded is not None and isinstance(self._dynamics, core.Handled)
+        self._hands = MovedHands(self.scene, self._recorded) if moves else None
+        self._begin(self._initial)
         self.frame: Frame = self._stepper.frame
-        self.frame_number = 0
         self.broken: str | None = None
         self.held: Bool[Tensor, " K"] = torch.zeros_like(self._free)
         self._forces: dict[str, Push] = {}
         self._impulses: list[Push] = []
-        self._steady: Gravity | None = None
-        self._wind: Wind | None = None
+        self._steady: events.Gravity | None = None
+        self._wind: events.Wind | None = None
 
     def step(self) -> Frame:
         """The next frame.
@@ -210,17 +179,17 @@ class Interaction:
     @property
     def hand(self) -> Int[Tensor, " K"] | None:
         """The hand that holds each kernel, -1 for none; None where the method moves no hands, or nothing is held."""
-        hand, moves = hand_of(self.scene), isinstance(self._dynamics, Handled)
+        hand, moves = hand_of(self.scene), isinstance(self._dynamics, core.Handled)
         return hand if moves and bool((hand >= 0).any()) else None
 
     def place_of_hand(self, number: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-        """Displacement of a hand from rest [scene units] and its rotation vector [radian], as of :class:`Hand`."""
+        """Displacement of a hand from rest [scene units] and its rotation vector [radian]."""
         found = [0.0] * 6 if self._hands is None else self._hands.places(self.frame_number)[number].tolist()
         return tuple(found[:3]), tuple(found[3:])
 
     def trajectory(self, frames: Sequence[Frame] | None = None) -> Trajectory:
         """The given frames of this session; by default the kept ones, from the initial or from the oldest kept."""
-        return trajectory_of(frames or self._frames or [self.frame], self._stepper)
+        return core.trajectory_of(frames or self._frames or [self.frame], self._stepper)
 
     def session(self) -> ForceSession:
         """The session so far, with all recorded events."""
@@ -251,74 +220,73 @@ class Interaction:
         """
         if len(self._entries) >= MOST_EVENTS:
             raise ConfigError(f"session: expected at most {MOST_EVENTS} events. Save it and begin another.")
-        if not isinstance(event, Reset | Release) and not self._stepper.takes_forces:
-            raise ConfigError(
-                f"{self.made_with.run or 'this method'}: takes no forces, only a reset. Play a run of gausim instead."
-            )
+        if not isinstance(event, events.Reset | events.Release) and not self._stepper.takes_forces:
+            raise ConfigError(f"{self._method}: takes no forces, only a reset. Play a run of gausim instead.")
         self._do(event)
         self._entries.append(Entry(self.tick, event))
 
+    @property
+    def _method(self) -> str:
+        return self.made_with.run or "this method"
+
     def _do(self, event: Event) -> None:
         match event:
-            case Force():
+            case events.Force():
                 push = self._push(event.on, event.direction, self._allowed("weights", event.weights), event.frames)
                 self._forces[event.name] = push
-            case Impulse():
+            case events.Impulse():
                 weights = self._allowed("weight_seconds", event.weight_seconds, per=self.fps)
                 self._impulses.append(self._push(event.on, event.direction, weights, 1))
-            case Release():
+            case events.Release():
                 for name in [event.name] if event.name is not None else list(self._forces):
                     self._forces.pop(name, None)
-            case Gravity():
+            case events.Gravity():
                 self._allowed("weights", event.weights)
                 self._steady = event if event.weights > 0 else None
-            case Wind():
+            case events.Wind():
                 self._allowed("weights", event.weights)
                 self._wind = event if event.weights > 0 else None
-            case Pin():
+            case events.Pin():
                 self.held = self.held | self._movable(event.on)
-            case Unpin():
+            case events.Unpin():
                 self.held = self.held & ~event.on.mask(self.scene, self.units).to(self.held.device)
-            case Hand():
+            case events.Hand():
                 self._move_hand(event)
-            case Material():
+            case events.Material():
                 self._adjust(event)
-            case Reset():
+            case events.Reset():
                 self._rest_all()
 
-    def _move_hand(self, event: Hand) -> None:
+    def _move_hand(self, event: events.Hand) -> None:
         """Moves a hand; the first one to move makes a stepper whose pins can, from the current state on."""
         if self.hand is None:
-            raise ConfigError(
-                f"{self.made_with.run or 'this method'}: nothing of '{self.scene.name}' is held by a hand that this "
-                "method can move. Play a run of gausim with pinned kernels."
-            )
+            raise ConfigError(f"{self._method}: nothing of '{self.scene.name}' is held by a hand that it can move.")
         if self._hands is None:
             self._hands = MovedHands(self.scene)
             self._go_on()
         self._hands.move(event, self.frame_number)
 
     def _go_on(self) -> None:
-        """Goes on from the current state with a new stepper, and with the hands if anything has moved them."""
+        """Goes on from the current state with a new stepper."""
         self._limited_before += self._stepper.limited
+        self._begin(self.state)
+
+    def _begin(self, state: SimState) -> None:
+        """Makes a stepper at a state, with the hands if anything has moved them."""
         hands, begin = self._hands, self.frame_number
-        if hands is not None and isinstance(self._dynamics, Handled):
-            self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
+        if hands is not None and isinstance(self._dynamics, core.Handled):
+            self._stepper = self._dynamics.stepper(state, lambda frame: hands.pose(frame + begin))
         else:
-            self._stepper = self._dynamics.stepper(self.state)
+            self._stepper = self._dynamics.stepper(state)
 
     @property
     def adjustable(self) -> bool:
         """Whether the material can be changed."""
-        return isinstance(self._dynamics, Adjustable)
+        return isinstance(self._dynamics, core.Adjustable)
 
-    def _adjust(self, event: Material) -> None:
-        """Changes the material."""
-        if not isinstance(self._dynamics, Adjustable):
-            raise ConfigError(
-                f"{self.made_with.run or 'this method'}: its material cannot be set. Take a run of model=gausim, or a "
-                "scene (--scene)."
-            )
+    def _adjust(self, event: events.Material) -> None:
+        if not isinstance(self._dynamics, core.Adjustable):
+            raise ConfigError(f"{self._method}: its material cannot be set. Take a run of model=gausim, or a scene.")
         self._dynamics.adjust(event.stiffness, event.damping)
         self._go_on()
 
@@ -362,23 +330,23 @@ class Interaction:
         return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
 
     def _check(self, frame: Frame) -> None:
-        number = self.frame_number + 1
         away = (frame.positions - self._rest).norm(dim=-1) / self._diagonal
         gone = ~(away <= FARTHEST)  # also NaN
         if bool(gone.any()):
             kernel = int(gone.nonzero()[0])
-            raise DivergenceError(
-                f"{self.scene.name}: kernel {kernel} is {float(away[kernel]):.3g} diagonals from rest at frame "
-                f"{number}, expected at most {FARTHEST:g}. Reset, and use smaller forces."
-            )
+            far = f"{float(away[kernel]):.3g} diagonals from rest, expected at most {FARTHEST:g}"
+            raise self._diverged(f"kernel {kernel} is {far}")
         g = frame.deformation_gradients.double()
-        volume = determinant(g).abs() / g.square().sum((-2, -1)).pow(1.5)
-        flat = ~(volume >= FLATTEST)
-        if bool(flat.any()):
-            unit = int(flat.nonzero()[0])
-            carried = (self.unit_of_kernel == unit).nonzero()
-            if len(carried):
-                raise DivergenceError(
-                    f"{self.scene.name}: the covariance of kernel {int(carried[0])} is no longer positive definite at "
-                    f"frame {number} (its unit {unit} is flattened). Reset, and use smaller forces."
-                )
+        flat = ~(determinant(g).abs() / g.square().sum((-2, -1)).pow(1.5) >= FLATTEST)
+        carried = flat[self.unit_of_kernel]
+        if bool(carried.any()):
+            kernel = int(carried.nonzero()[0])
+            unit = int(self.unit_of_kernel[kernel])
+            raise self._diverged(
+                f"the covariance of kernel {kernel} is no longer positive definite (its unit {unit} is flattened)"
+            )
+
+    def _diverged(self, what: str) -> DivergenceError:
+        return DivergenceError(
+            f"{self.scene.name}: at frame {self.frame_number + 1} {what}. Reset, and use smaller forces."
+        )

@@ -9,8 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -227,60 +225,47 @@ def load_session(path: Path | str) -> ForceSession:
     """Reads a session.
 
     Raises:
-        DataError: the file is missing, too large, no JSON, of another format, or a field is invalid, unknown, missing
-            or not finite; the message names the file, the event and the field.
+        DataError: the file is missing or too large, or its text is invalid, see :func:`parse_session`.
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
+        if (size := path.stat().st_size) > MOST_BYTES:
             raise DataError(f"{path}: expected a session of at most {MOST_BYTES >> 20} MiB, got {size} bytes.")
         return parse_session(path.read_bytes(), str(path))
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file. Save one in `gausim view`, or with `save_session`.") from None
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error}).") from error
+        raise DataError(f"{path}: cannot be read ({error.strerror}). Save a session in `gausim view`.") from error
 
 
 def parse_session(text: str | bytes, source: str = "session") -> ForceSession:
     """Parses a session from its UTF-8 text; error messages call it ``source``.
 
     Raises:
-        DataError: the text is invalid, see :func:`load_session`.
+        DataError: the text is no JSON, of another format, or a field is invalid, unknown, missing or not finite; the
+            message names the event and the field.
     """
+    place = ""
     try:
         value = msgspec.json.decode(text)
-        found = value.get("format") if isinstance(value, dict) else type(value).__name__
+        found = value.pop("format", None) if isinstance(value, dict) else type(value).__name__
         if found != FORMAT:
             raise ConfigError(f"field 'format': expected {FORMAT!r}, got {str(found)[:80]!r}.")
-        return _session({name: item for name, item in value.items() if name != "format"})
+        events = value.pop("events", None)
+        if not isinstance(events, list):
+            raise ConfigError("field 'events': expected a list.")
+        place = "field 'made_with': "
+        value["made_with"] = made(MadeWith, value.get("made_with"))
+        entries = []
+        for number, item in enumerate(events[: MOST_EVENTS + 1]):
+            place = f"event {number}: "
+            entries.append(_entry(item))
+        place = ""
+        session: ForceSession = made(ForceSession, value | {"entries": tuple(entries)})
     except RecursionError:
         raise DataError(f"{source}: is nested too deeply. Write the session again.") from None
     except (msgspec.DecodeError, UnicodeDecodeError, ConfigError) as error:
         what = str(error).removesuffix(".")
-        raise DataError(f"{source}: {what}. Correct it, or record the session again.") from error
-
-
-def _session(value: dict[str, Any]) -> ForceSession:
-    events = value.pop("events", None)
-    if not isinstance(events, list):
-        raise ConfigError("field 'events': expected a list.")
-    with _inside("field 'made_with'"):
-        value["made_with"] = made(MadeWith, value.get("made_with"))
-    entries = []
-    for place, item in enumerate(events[: MOST_EVENTS + 1]):
-        with _inside(f"event {place}"):
-            entries.append(_entry(item))
-    session: ForceSession = made(ForceSession, value | {"entries": tuple(entries)})
+        raise DataError(f"{source}: {place}{what}. Correct it, or record the session again.") from error
     return session
-
-
-@contextmanager
-def _inside(place: str) -> Iterator[None]:
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(f"{place}: {error}") from error
 
 
 def _entry(item: Any) -> Entry:

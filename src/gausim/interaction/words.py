@@ -15,17 +15,6 @@ if TYPE_CHECKING:
 
 # Radius of the ball about the tip [diagonals].
 _TIP = 0.15
-# Required and optional keys of each kind of event.
-_WORDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "force": (("weights", "direction"), ("on", "at", "frames")),
-    "impulse": (("weight_seconds", "direction"), ("on", "at")),
-    "wind": (("weights", "direction"), ("gusts", "at")),
-    "gravity": (("weights", "direction"), ("at",)),
-    "pin": (("on",), ("at",)),
-    "unpin": ((), ("on", "at")),
-    "hand": (("to",), ("frames", "turn", "hand", "at")),
-    "material": ((), ("stiffness", "damping", "at")),
-}
 _HELP = {
     "force": "on=PART weights=W direction=D [at=FRAME] [frames=N]: W times the part's weight, from FRAME, for N frames",
     "impulse": "on=PART weight_seconds=J direction=D [at=FRAME]: the speed that weight gives in J seconds, at once",
@@ -66,7 +55,7 @@ def add_force_options(parser: argparse.ArgumentParser) -> None:
 
 def has_forces(arguments: argparse.Namespace) -> bool:
     """Whether any option for forces was given."""
-    return any(getattr(arguments, kind) for kind in _WORDS)
+    return any(getattr(arguments, kind) for kind in _HELP)
 
 
 def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entry]:
@@ -75,7 +64,7 @@ def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entr
     Raises:
         ConfigError: a key is unknown or missing, or a value is invalid; the message names the option.
     """
-    given = [(kind, words) for kind in _WORDS for words in getattr(arguments, kind)]
+    given = [(kind, words) for kind in _HELP for words in getattr(arguments, kind)]
     entries = [entry_of(kind, words, scene, name=f"force {number}") for number, (kind, words) in enumerate(given)]
     return sorted(entries, key=lambda entry: entry.at)
 
@@ -86,31 +75,30 @@ def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str
     Raises:
         ConfigError: a key is unknown or missing, or a value is invalid; the message names the option.
     """
+    from msgspec.structs import fields
+
+    from gausim.interaction.checked import made
+    from gausim.interaction.selections import Whole
     from gausim.interaction.session import KINDS, Entry
 
-    needed, allowed = _WORDS[kind]
     read: dict[str, Callable[[str], Any]] = {
         "on": lambda text: parse_part(text, scene), "direction": parse_direction, "frames": _whole, "at": _whole,
         "to": parse_direction, "turn": parse_direction, "hand": _whole,
     }  # fmt: skip
+    values: dict[str, Any] = {"on": Whole()} if kind in ("force", "impulse") else {}
+    values |= {"name": name} if kind == "force" else {}
+    known = {"at", *(field.name for field in fields(KINDS[kind]) if field.name != "name")}
+    texts: dict[str, str] = {}
     try:
-        values: dict[str, Any] = {"at": 0} | ({"name": name} if kind == "force" else {})
-        if kind in ("force", "impulse"):
-            values["on"] = parse_part("whole", scene)
-        texts: dict[str, str] = {}
         for word in words:
             key, equals, text = word.partition("=")
-            if not equals or key not in (*needed, *allowed) or key in texts:
-                known = ", ".join((*needed, *allowed))
-                raise ConfigError(f"'{word}': expected KEY=VALUE, each once, with a key of {known}.")
+            if not equals or key not in known or key in texts:
+                raise ConfigError(f"'{word}': expected KEY=VALUE, each once, with a key of {', '.join(sorted(known))}.")
             texts[key] = text
-        missing = [key for key in needed if key not in texts]
-        if missing:
-            raise ConfigError(f"'{missing[0]}=' is missing. Expected {_HELP[kind]}.")
         values |= {key: read.get(key, _number)(text) for key, text in texts.items()}
-        return Entry(values.pop("at"), KINDS[kind](**values))
+        return Entry(values.pop("at", 0), made(KINDS[kind], values))
     except ConfigError as error:
-        raise ConfigError(f"--{kind} {' '.join(words)}: {error}") from error
+        raise ConfigError(f"--{kind} {' '.join(words)}: {error} Expected {_HELP[kind]}.") from error
 
 
 def parse_part(text: str, scene: GaussianScene) -> Selected:

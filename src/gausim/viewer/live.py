@@ -15,12 +15,10 @@ import msgspec
 from gausim.core import ConfigError, DivergenceError, GausSimError, Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.selections import Kernels, Unit
-from gausim.interaction.session import Event, ForceSession, Release
+from gausim.interaction.session import Event, ForceSession
 from gausim.viewer.pipeline import Rate
 from gausim.viewer.shown import LIVE, Shown, Take, shown_frame
 
-# Largest number of waiting commands, beyond any manual input.
-_MOST_COMMANDS = 1024
 # Largest memory of the live simulation's timeline [bytes].
 _HISTORY_BYTES = 128 << 20
 _log = logging.getLogger(__name__)
@@ -85,8 +83,8 @@ class Live(threading.Thread):
         super().__init__(name="gausim-simulate", daemon=True)
         self.interaction, self.takes, self.companion = interaction, tuple(takes), companion
         self._publish, self._watched = publish, watched
-        self._commands: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_COMMANDS)
-        self._overrun = self._stopping = False
+        self._commands: queue.Queue[Callable[[], None]] = queue.Queue()
+        self._stopping = False
         self.message, self.playing, self.pace, self.source = "", True, 1.0, LIVE
         self.rate = Rate()
         size = 4 * 2 * (interaction.frame.positions.numel() + interaction.frame.deformation_gradients.numel())
@@ -97,11 +95,8 @@ class Live(threading.Thread):
         self._remember()
 
     def do(self, command: Callable[[], None]) -> None:
-        """Queues a command for this thread; if the queue is full, all forces are released instead."""
-        try:
-            self._commands.put_nowait(command)
-        except queue.Full:
-            self._overrun = True
+        """Queues a command for this thread."""
+        self._commands.put(command)
 
     def stop(self) -> None:
         """Ends the thread."""
@@ -135,10 +130,6 @@ class Live(threading.Thread):
             self._guarded(command)
             if not self.playing:
                 self._publish(self.shown())
-        if self._overrun:
-            self._overrun = False
-            self.message = "Too much at once: all forces were let go."
-            self._guarded(lambda: self.interaction.act(Release()))
 
     def _guarded(self, work: Callable[[], None]) -> None:
         try:
