@@ -167,7 +167,7 @@ def misfit(method: PhysDreamer, targets: list[Tensor], frames: int, begun: Fitte
 
 
 def test_the_gradient_with_respect_to_the_modulus_is_its_difference_quotient() -> None:
-    targets, method = observed(dreamer(), 5), dreamer(young_modulus=TRUE / 10, substeps=25)
+    targets, method = observed(dreamer(), 5), dreamer(young_modulus=TRUE / 10, most_substeps=25)
     bias = method.modulus_field[0].network[-1].bias  # type: ignore[index,union-attr]
     loss = misfit(method, targets, 5, swaying(method))
     (slope,) = torch.autograd.grad(loss, [bias])

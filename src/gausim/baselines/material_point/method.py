@@ -82,19 +82,15 @@ class SceneMapping:
 
 @dataclass(frozen=True)
 class Discretisation:
-    """Options of the grid, the substeps and the filling.
+    """Options of the grid, the time step and the filling.
 
     Attributes:
         cells: per axis of the method's unit of length.
-        damping: rate at which the grid loses velocity [1 / s].
-        substeps: per frame; None derives them from the bound of the time step.
         courant: c of the bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
         filling: thresholds by which the interior gets particles; None leaves it empty.
     """
 
     cells: int
-    damping: float = 0.0
-    substeps: int | None = None
     courant: float = 0.5
     filling: Filling | None = None
 
@@ -106,12 +102,12 @@ class Domain:
     side: float  # longest side of the scene in the simulation [simulation units]
     size: float  # edge of the cubic domain, in whose middle the scene is [simulation units]
     cells: int  # cells per axis over the whole domain
-    settings: Discretisation  # damping, substeps and filling of the interior
+    settings: Discretisation  # time step and filling of the interior
 
     @property
     def grid(self) -> Grid:
         """The background grid."""
-        return Grid(cells=self.cells, size=self.size, damping=self.settings.damping)
+        return Grid(cells=self.cells, size=self.size)
 
     def grid_of(self, scene: GaussianScene) -> Grid:
         """The background grid with a scene's gravity and floor."""
@@ -226,7 +222,7 @@ class MaterialPoints(Fitted):
     def _body(self, scene_id: int, driven: Driven) -> Body:
         scene, domain = self.scenes[scene_id], self.domain
         settings, grid = domain.settings, domain.grid_of(scene)
-        mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], settings.substeps, settings.courant)
+        mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], courant=settings.courant)
         particles = Particles.create(
             mapping.to_simulation(driven.rest), grid=grid, density=self.material.density, pinned=driven.pinned
         )

@@ -102,13 +102,12 @@ class PhysDreamer(MaterialPoints):
         self.most, self.cells, self.field = particles, cells, modulus
         self.initial = require_modulus(material.young_modulus)
         domain = Domain(SIDE, SIZE, round(SIZE * cells), discretisation)
-        most = discretisation.substeps or most_substeps
-        self.greatest = [self._bound(rate, most, material, domain) for rate in recorded["fps"]]
+        self.greatest = [self._bound(rate, most_substeps, material, domain) for rate in recorded["fps"]]
         if self.initial > min(self.greatest):
             raise ConfigError(
-                f"model.method.material.young_modulus: {self.initial:g} would need more than {most} "
+                f"model.method.material.young_modulus: {self.initial:g} would need more than {most_substeps} "
                 f"substeps per frame on {cells} cells, which allow {min(self.greatest):.3g}. Raise most_substeps "
-                "(or discretisation.substeps), or lower discretisation.cells."
+                "or lower discretisation.cells."
             )
         super().__init__(
             **recorded,
