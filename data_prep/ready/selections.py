@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gausim.core import DataError, GaussianScene, SceneError
 from gausim.io.npz import read_array
-from gausim.io.ply import MASK_NAMES, positions, read_ply
+from gausim.io.ply import MASK_NAMES, read_ply
 from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selection, parse_half_space
 
 # Syntax of a term, by its first word.
@@ -83,8 +83,11 @@ def parse_selection(text: str) -> tuple[Selection, list[Path]]:
 def read_points(path: Path) -> np.ndarray:
     """(P, 3) float32 points of an ``npz`` (array ``points``), a ``ply`` or a text of three numbers per line."""
     if path.suffix.lower() == ".ply":
-        found = (positions(path, element) for element in read_ply(path) if element.name == "vertex")
-        points = next(found, np.zeros(0))
+        try:
+            vertices = read_ply(path)["vertex"]
+            points = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], 1)
+        except (KeyError, ValueError, TypeError) as error:
+            raise DataError(f"{path}: expected an element 'vertex' with numbers x, y and z ({error}).") from error
     elif not path.is_file():
         raise DataError(f"{path}: no such file. Expected points as npz, ply or txt.")
     elif path.suffix.lower() == ".npz":

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.lib.recfunctions import structured_to_unstructured
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from gausim.core.errors import DataError, SceneError
@@ -57,23 +57,6 @@ def read_ply(path: Path) -> PlyData:
     if left > 2:
         raise DataError(f"{path}: has {left} bytes after what its header declares. Export it again.")
     return ply
-
-
-def list_properties(element: PlyElement) -> list[str]:
-    """Names of an element's properties that are lists."""
-    return [p.name for p in element.properties if isinstance(p, PlyListProperty)]
-
-
-def positions(path: Path, element: PlyElement) -> Float[np.ndarray, "N 3"]:
-    """The properties x, y and z of an element as float64.
-
-    Raises:
-        DataError: one is missing or a list.
-    """
-    numbers = sorted({p.name for p in element.properties} - set(list_properties(element)))
-    if not {"x", "y", "z"} <= set(numbers):
-        raise DataError(f"{path}: '{element.name}' has properties {numbers}, expected x, y and z.")
-    return np.stack([np.asarray(element[axis], np.float64) for axis in "xyz"], 1)
 
 
 def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str | None = None) -> GaussianScene:
@@ -212,7 +195,7 @@ def _read_vertices(path: Path) -> np.ndarray:
     if not elements or elements[0].name != "vertex":
         found = f"'{elements[0].name}'" if elements else "none"
         raise SceneError(f"{path}: first element must be 'vertex', got {found}. Expected a 3DGS scene.")
-    lists = list_properties(elements[0])
+    lists = [p.name for p in elements[0].properties if isinstance(p, PlyListProperty)]
     if elements[0].count == 0 or lists:
         what = f"property '{lists[0]}' is a list" if lists else "is empty"
         raise SceneError(f"{path}: element 'vertex': {what}. Export the file as a 3DGS scene.")
