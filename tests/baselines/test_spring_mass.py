@@ -13,18 +13,15 @@ from helpers.fitted_methods import recorded, rolled
 from helpers.toy_object import toy_scene
 
 from gausim.baselines.deformation_field import DeformationField
-from gausim.baselines.linear_tracks import LinearTracks
 from gausim.baselines.spring_gaus.anchors import Anchors
-from gausim.baselines.spring_gaus.spring_mass import ConstantVelocity, SpringMass, slowest_vibration
+from gausim.baselines.spring_gaus.spring_mass import SpringMass, slowest_vibration
 from gausim.core import (
     ConfigError,
     DivergenceError,
     Floor,
     SceneError,
-    SimState,
     Surroundings,
 )
-from gausim.core.fitted import FittedDynamics
 from gausim.ops.rotation import quaternion_to_matrix
 
 
@@ -52,15 +49,12 @@ def test_surroundings_that_springs_do_not_know_are_refused(around: dict[str, Any
     scene = replace(toy_scene(), surroundings=Surroundings(**around))
     with pytest.raises(ConfigError, match=rf"spring_mass: 'toy' has {text} in its dataset.json, .*model=gausim"):
         SpringMass(anchors=40, **recorded(toy_scene(), scene))
-    if "free" not in around:
-        ConstantVelocity(anchors=40, **recorded(toy_scene(), scene))
 
 
 def test_no_baseline_keeps_pins_in_place_that_hands_move() -> None:
     scene = toy_scene()
     held = recorded(replace(scene, hand=torch.where(scene.pinned, 0, -1)))
-    for method in (partial(SpringMass, anchors=40), partial(ConstantVelocity, anchors=40),
-                   partial(LinearTracks, anchors=40), DeformationField):  # fmt: skip
+    for method in (partial(SpringMass, anchors=40), DeformationField):
         with pytest.raises(ConfigError, match="'toy' has a 'grip' of hands"):
             method(**held)
 
@@ -161,18 +155,6 @@ def test_stiff_springs_get_more_substeps_and_too_stiff_ones_a_message() -> None:
         method.stiffness[0] += 6
         with pytest.raises(DivergenceError, match=r"'toy'.*substeps per frame.*model\.method\.substeps"):
             method.advance(method.begin(0))
-
-
-def test_constant_velocity_goes_on_for_ever() -> None:
-    method = ConstantVelocity(**recorded(), anchors=20)
-    with torch.no_grad():
-        method.velocity[0][:, 1] = 0.01
-    rest = toy_scene().means
-    with torch.no_grad():
-        x = FittedDynamics(method, 0).rollout(SimState(rest, rest), 20).positions
-    torch.testing.assert_close(x[20] - x[0], 20 * (x[1] - x[0]), rtol=1e-3, atol=1e-5)
-    fastest = float((x[1] - x[0]).norm(dim=1).max()) / toy_scene().diagonal  # some follow pinned anchors, too
-    assert 0.005 < fastest < 0.0101
 
 
 def test_wrong_settings_name_their_field() -> None:

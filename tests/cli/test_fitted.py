@@ -6,12 +6,14 @@ import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from helpers.toy_object import write_toy_object
 from helpers.toy_runs import rows
 
+from gausim.baselines.fitting import Fit
 from gausim.cli import evaluate, report, simulate, train
 from gausim.compose.build import load_run
 from gausim.core import ConfigError
@@ -25,11 +27,6 @@ TINY = (
 STAGES = "model.plan.stages"
 SMALL: dict[str, list[str]] = {
     "static": [],
-    "constant_velocity": ["model.method.anchors=12", f"{STAGES}.velocity.iterations=6", "model.plan.round=3"],
-    "linear_tracks": [
-        "model.method.anchors=12", "model.method.neighbours=8", "model.method.basis=6", "model.method.modes=2",
-        f"{STAGES}.tracks.iterations=4", "model.plan.round=2",
-    ],
     "spring_mass": [
         "model.method.anchors=12", "model.method.neighbours=8", "model.method.substeps=10", "model.plan.round=2",
         f"{STAGES}.velocity.iterations=4", f"{STAGES}.dynamics.iterations=2",
@@ -70,8 +67,7 @@ def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) 
     results = load_results(run / "evaluation" / "metrics.json")
     (row,) = results.objects["toy"].methods
     notes = results.objects["toy"].notes[row]
-    name = {"linear_tracks": "linear AR(2) on tracked motion"}.get(model, model)
-    assert row.startswith(name) and row in {e.row for e in results.table} and notes
+    assert row.startswith(model) and row in {e.row for e in results.table} and notes
     assert all(note in (run / "evaluation" / "table.md").read_text() for note in notes)
     assert simulate.main([str(run), "--frames", "12", "--cameras", "cam_0"]) == 0
     assert report.main([str(run), "--out", "page", "--no-pictures"]) == 0
@@ -92,11 +88,11 @@ def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
     made = weights("toy")
     moved = {name: bool(value.abs().max() > 0) for name, value in made.items() if "velocity" in name}
     assert len(moved) == 2 and all(moved.values())
-    assert float(made["model.method.stiffness.0"].std()) > 1e-4 and float(made["model.method.damping.0"]) != -1.0
+    assert float(made["model.stiffness.0"].std()) > 1e-4 and float(made["model.damping.0"]) != -1.0
     train.main(["model=spring_mass", *SMALL["spring_mass"], f"{STAGES}.dynamics=null", *arguments, "name=short"])
     short = weights("short")
-    assert float(short["model.method.stiffness.0"].std()) < 1e-6  # all alike
-    assert torch.equal(short["model.method.velocity.1"], made["model.method.velocity.1"])
+    assert float(short["model.stiffness.0"].std()) < 1e-6  # all alike
+    assert torch.equal(short["model.velocity.1"], made["model.velocity.1"])
 
 
 @pytest.mark.slow
@@ -106,20 +102,19 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
 ) -> None:
     if model.startswith("phys"):
         pytest.importorskip("warp")
-    from gausim.training.callbacks.resume import RunCheckpoint
-
-    asked = [f"model={model}", *SMALL[model], *arguments, "trainer.checkpoint_steps=1"]
+    asked = [f"model={model}", *SMALL[model], *arguments]
+    monkeypatch.setattr("gausim.baselines.fitting.SAVED_AFTER", -1.0)  # after every step
     train.main([*asked, "name=whole"])
-    saved, calls = RunCheckpoint.on_train_batch_end, []
+    step, calls = Fit._step, []
 
-    def crash(self: RunCheckpoint, *args: object) -> None:
-        saved(self, *args)  # type: ignore[arg-type]
-        calls.append(1)
+    def crash(self: Fit, *args: Any) -> None:
         if len(calls) == 6:  # within the second epoch of four steps
             raise MemoryError("power cut")
+        calls.append(1)
+        step(self, *args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(RunCheckpoint, "on_train_batch_end", crash)
+        patch.setattr(Fit, "_step", crash)
         with pytest.raises(MemoryError):
             train.main([*asked, "name=cut"])
     train.main([*asked, "name=cut"])
@@ -172,12 +167,12 @@ def test_physgaussian_takes_over_what_physdreamer_has_found(
     found, given = weights("found"), weights("given")
     shared = [name for name in given if ".velocity." in name]
     assert shared and all(torch.equal(given[name], found[name]) for name in shared)
-    young = given["model.method.young_0"]
+    young = given["model.young_0"]
     assert float(young.std()) > 0  # the field, which has learned a little; 1e5 there is 0.324e5 here
     assert 0.324e5 / 1.5 < float(young.mean()) < 0.324e5 * 1.5
     Path("outputs/found").rename("outputs/gone")
     loaded = load_run(Path("outputs/given/seed_0"))  # all that it needs is its own
-    assert torch.equal(loaded.module.simulator.state_dict()["method.young_0"], young)
+    assert torch.equal(loaded.module.state_dict()["model.young_0"], young)
     with pytest.raises(ConfigError, match=r"init_from: physgaussian takes over.*is of physgaussian"):
         train.main([*alone, "init_from=outputs/given/seed_0", "name=again"])
     with pytest.raises(ConfigError, match=r"freeze: physgaussian.*Leave freeze null"):

@@ -51,7 +51,6 @@ def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSet
         renderer=ReferenceRenderer(),
         objective=objective,
         optimizer=settings,
-        fraction_every=1,
     )
     return module.to(dtype)
 
@@ -74,8 +73,6 @@ def train(options: dict[str, Any]) -> dict[str, Any]:
     with torch.no_grad():
         for parameter in module.simulator.parameter_groups()["network"]:
             parameter.mul_(options.get("wild", 1.0))
-    if options.get("deferred"):  # as on a GPU
-        module.defers = lambda device: True  # type: ignore[method-assign]
     optimizer, whole = module.configure_optimizers(), samples(options["count"], options.get("steps", 3), dtype)
     share, stats = whole[ranks.rank :: ranks.size], []
     for step in range(options.get("times", 1)):

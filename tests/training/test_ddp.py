@@ -57,7 +57,7 @@ def test_the_gradient_of_a_step_is_that_of_one_rank(ask: Ask, dtype: str, tolera
     [
         (2, {"count": 5, "times": 3, "objective": {**ALL, "backprop_steps": 2}}, 1e-9),  # steps follow each other
         (3, {"count": 1, "times": 2, "objective": ALL}, 1e-9),  # ranks without a sequence
-        (2, {"count": 3, "objective": {"checkpoint_steps": True, "backprop_steps": 0}}, 1e-11),
+        (2, {"count": 3, "objective": {"backprop_steps": 0}}, 1e-11),
         (2, {"count": 3, "objective": {"momentum_weight": 0.0}}, 1e-11),
     ],
 )
@@ -67,11 +67,9 @@ def test_ranks_learn_what_one_does(ask: Ask, ranks: int, options: dict[str, Any]
     )
 
 
-@pytest.mark.parametrize(
-    ("limit", "ends", "deferred"), [(0.3, "in between", False), (0.3, "in between", True), (1e-4, "at once", True)]
-)
-def test_a_rollout_ends_on_all_ranks_where_it_ends_on_one(ask: Ask, limit: float, ends: str, deferred: bool) -> None:
-    options = {"count": 3, "dtype": "float64", "steps": 5, "wild": 2.2, "deferred": deferred,
+@pytest.mark.parametrize(("limit", "ends"), [(0.3, "in between"), (1e-4, "at once")])
+def test_a_rollout_ends_on_all_ranks_where_it_ends_on_one(ask: Ask, limit: float, ends: str) -> None:
+    options = {"count": 3, "dtype": "float64", "steps": 5, "wild": 2.2,
                "objective": {"explosion": limit, "static_probability": 1.0}}  # fmt: skip
     alone = ask("train", 1, **options)[0]
     assert alone["stats"][0]["exploded"] == 1.0
@@ -81,9 +79,8 @@ def test_a_rollout_ends_on_all_ranks_where_it_ends_on_one(ask: Ask, limit: float
 
 def test_a_divergence_is_named_on_all_ranks(ask: Ask) -> None:
     expected = r"training diverged at predicted step 1 of 3, sequence toy/seq_0: positions are nan"
-    for deferred in (False, True):
-        found = ask("train", 2, count=3, wild=1e30, deferred=deferred)
-        assert all(expected in answer["error"] for answer in found) and found[0] == found[1]
+    found = ask("train", 2, count=3, wild=1e30)
+    assert all(expected in answer["error"] for answer in found) and found[0] == found[1]
 
 
 def test_metrics_of_an_uneven_set_are_those_of_all_of_it(ask: Ask) -> None:

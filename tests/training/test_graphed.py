@@ -29,7 +29,7 @@ TEMPLATES = pytest.mark.parametrize("template", [RestTemplate, ELASTIC, MATERIAL
 
 
 def module_on(device: str, **options: Any) -> GausSimModule:
-    module = real_module(parts={"objective": OBJECTIVE, "fraction_every": 0}, **options).to(device)
+    module = real_module(parts={"objective": OBJECTIVE}, **options).to(device)
     module.images.renderer = blobs
     return module
 

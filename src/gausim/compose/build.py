@@ -11,6 +11,7 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from gausim.baselines.fitting import FittedModule
 from gausim.compose.config import instantiate
 from gausim.compose.data_paths import absolute, located
 from gausim.compose.device import find_device
@@ -25,8 +26,6 @@ from gausim.render.gsplat import GsplatRenderer
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
-from gausim.training.fitted.fitting import StagedFit
-from gausim.training.fitted.stages import StagedCurriculum
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.plan import DataFacts, TrainingPlan
@@ -41,7 +40,7 @@ class LoadedRun:
     """A trained run, loaded for evaluation or simulation."""
 
     config: dict[str, Any]  # the resolved configuration
-    module: GausSimModule  # the module in evaluation mode, with the run's weights
+    module: GausSimModule | FittedModule  # the module in evaluation mode, with the run's weights
     objects: list[ObjectData]  # the objects; their index is the ``scene_id`` of the module's scenes
     datamodule: ReadyDataModule  # the data
     renderer: Renderer  # the renderer of the training, or the one that fits the device
@@ -49,7 +48,9 @@ class LoadedRun:
     device: torch.device = torch.device("cpu")  # where the module is
 
 
-def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:
+def build(
+    cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True
+) -> tuple[GausSimModule | FittedModule, ReadyDataModule]:
     """Builds the module and the data of a training configuration.
 
     ``sealed`` refuses unseen frames and the true motion of the test part.
@@ -58,44 +59,48 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
-    fits = "method" in config.model
-    if not fits and ("simulator" not in config.model or "initial_states" not in config.model):
-        raise ConfigError(
-            "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
-            "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
-            f"{sorted(str(k) for k in config.model)}."
-        )
     datamodule = open_data(config, sealed=sealed)
-    course = resolved_plan(config, datamodule)
-    datamodule.plan = course
-    plan = None
-    if fits:  # its stages set T and the shows per epoch
-        plan = instantiate(config.model.plan)
-        datamodule.plan = StagedCurriculum(plan, course.t_max or 1, course.batch_size or 1)
+    datamodule.plan = resolved_plan(config, datamodule)
+    if "method" in config.model:
+        return _fitted(config, datamodule), datamodule
+    if "simulator" in config.model and "initial_states" in config.model:
+        return _simulator(config, datamodule), datamodule
+    raise ConfigError(
+        "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, ...), or "
+        f"'method' and 'plan' of one that is fitted (spring_mass, ...), got {sorted(str(k) for k in config.model)}."
+    )
+
+
+def _fitted(config: DictConfig, datamodule: ReadyDataModule) -> FittedModule:
+    method = instantiate(
+        config.model.method,
+        scenes=[item.scene() for item in datamodule.objects],
+        fps=[item.fps for item in datamodule.objects],
+        scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
+        seen=cast(TrainingPlan, datamodule.plan).t_max,
+    )()
+    explosion = (instantiate(config.loss) if config.get("loss") else Objective()).explosion
+    return FittedModule(
+        method, instantiate(config.model.plan), renderer=instantiate(config.render), explosion=explosion
+    )
+
+
+def _simulator(config: DictConfig, datamodule: ReadyDataModule) -> GausSimModule:
     scenes = [item.scene() for item in datamodule.objects]
-    given = {"scenes": scenes, "fps": [item.fps for item in datamodule.objects]}
-    renderer, objective = instantiate(config.render), instantiate(config.loss) if config.get("loss") else Objective()
-    if plan is None:
-        model = instantiate(config.model.simulator, **given)()
-        method: SharedSimulator | StagedFit = _shared_simulator(config, model, datamodule)
-        smooth, learns = model.smooth_motions, objective
-    else:
-        given |= {"scene_of_sequence": [scene_id for scene_id, _ in datamodule.index.entries]}
-        fitted = instantiate(config.model.method, **given, seen=course.t_max)()
-        method = StagedFit(fitted, plan, cast(StagedCurriculum, datamodule.plan), objective.explosion)
-        smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
-    sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image, method.references)
-    node = config.get("supervision")
-    module = GausSimModule(
+    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in datamodule.objects])()
+    method, node = _shared_simulator(config, model, datamodule), config.get("supervision")
+    truth, references = datamodule.index.ground_truth, method.references
+    sources = Sources(scenes, truth, model.smooth_motions, renderer, objective.image, references)
+    return GausSimModule(
         method=method,
         renderer=renderer,
-        objective=learns,
-        optimizer=None if fits else instantiate(config.optimizer),
+        objective=objective,
+        optimizer=instantiate(config.optimizer),
         supervision=instantiate(node)(sources) if node else None,
-        plan=course,
+        plan=cast(TrainingPlan, datamodule.plan),
         seed=int(config.seed),
     )
-    return module, datamodule
 
 
 def open_data(config: DictConfig, *, sealed: bool = True) -> ReadyDataModule:
@@ -198,18 +203,18 @@ def load_corpus_run(
     """Loads a run of which :func:`is_pretrained` is true; arguments and errors are those of :func:`load_run`."""
     place = find_device(device)
     _, module, datamodule = _load(RunDirectory(run_dir), "last.ckpt", data)
-    return module.to(place), cast(CorpusDataModule, datamodule)
+    return cast(GausSimModule, module.to(place)), cast(CorpusDataModule, datamodule)
 
 
 def _load(
     directory: RunDirectory, checkpoint: str, data: Mapping[str, Any] | None
-) -> tuple[dict[str, Any], GausSimModule, ReadyDataModule]:
+) -> tuple[dict[str, Any], GausSimModule | FittedModule, ReadyDataModule]:
     """Configuration, module and data of a run, in evaluation mode with the run's weights."""
     config = directory.config()
     loaded = read_checkpoint(directory.path / checkpoint)
     config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
-    check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
+    check_scenes(loaded, module.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)
     module.eval()

@@ -10,16 +10,16 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from gausim.baselines.fitting import FittedModule
 from gausim.compose.build import LoadedRun
 from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of
-from gausim.core import ConfigError, DataError, FittedDynamics, GaussianScene, HandPath, SimState, Steppable
+from gausim.core import ConfigError, DataError, GaussianScene, HandPath, SimState, Steppable
 from gausim.core.state import initial_sway
 from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.step.simulator import GausSim
 from gausim.ops.covariance import kernel_volumes
-from gausim.training.fitted.fitting import StagedFit
 
 REST = "rest"
 # Limit of the energy from forces, as a multiple of the initial energy of recorded motions; training covers little more.
@@ -95,9 +95,9 @@ def _method(
     if sequence != REST and sequence not in names:
         raise DataError(f"{item.data.root}: has no sequence '{sequence}'; expected '{REST}' or one of {names}.")
     index = 0 if sequence == REST else names.index(sequence)
-    if isinstance(module.method, StagedFit):
+    if isinstance(module, FittedModule):
         volumes = kernel_volumes(scene.log_scales, scene.volume_scale) * scene.simulated
-        return still, FittedDynamics(module.method.fitted, item.first_sequence + index), volumes, None, None
+        return still, module.dynamics(item.first_sequence + index), volumes, None, None
     if not isinstance(module.model, GausSim):
         raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated by itself. Take a run of gausim.")
     states = cast(Any, module.initial_states)

@@ -64,7 +64,7 @@ def sequence_of(item: RunObject, name: str) -> SequenceRecord:
 
 def scene_of(run: LoadedRun, item: RunObject) -> GaussianScene:
     """The rest scene that the run was trained on."""
-    return run.module.simulator.scenes[item.scene_id]
+    return run.module.scenes[item.scene_id]
 
 
 def state_of(run: LoadedRun) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
         cast(Any, run.module.initial_states),
     )
     dynamics = SceneDynamics(model, item.scene_id)
-    first, hands = states.state(item.first_sequence).detach(), run.module.method.hands(item.first_sequence)
+    first, hands = states.state(item.first_sequence).detach(), cast(Any, run.module).method.hands(item.first_sequence)
     free = scene.simulated & ~scene.pinned
     pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
     still = SimState(scene.means, scene.means)

@@ -43,16 +43,12 @@ class Objective:
 
     Attributes:
         image: loss between a predicted and a true image.
-        image_weight: weight of the image loss (mean over views).
         static_weight: weight of the static loss [diagonals^2].
         rest_image_weight: weight of the image loss of one step from the rest state against frame 0, in batches with the
             static loss.
         static_probability: probability of the static loss in a batch; None is 1 / T.
         momentum_weight: weight of the momentum loss [(total mass x diagonals)^2], times the rest state's loss.
-        over_steps: ``mean`` or ``sum`` of image and momentum losses over the steps of a rollout.
         backprop_steps: loss gradients stop after this number of steps; 0 lets them through the whole rollout.
-        checkpoint_steps: recompute each step in the backward pass from its input; same loss gradients in less memory,
-            for about a third more time of the dynamics.
         energy: the loss on energy gained by free motion.
         mixing_weight: weight of the penalty on mode mixing (squares of the template's mixing matrices), times the rest
             state's loss; it keeps the initial modes where the frames do not determine them.
@@ -61,14 +57,11 @@ class Objective:
     """
 
     image: ImageLoss = field(default_factory=ImageLoss)
-    image_weight: float = 1.0
     static_weight: float = 10.0
     rest_image_weight: float = 0.0
     static_probability: float | None = None
     momentum_weight: float = 1.5e4
-    over_steps: str = "mean"
     backprop_steps: int = 0
-    checkpoint_steps: bool = False
     energy: EnergyLoss = field(default_factory=EnergyLoss)
     mixing_weight: float = 0.01
     explosion: float = 3.0
@@ -79,14 +72,8 @@ class Objective:
         negative = [name for name in names if getattr(self, name) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
-        if self.over_steps not in ("mean", "sum"):
-            raise ConfigError(f"loss.over_steps: expected mean or sum, got '{self.over_steps}'.")
         if self.static_probability is not None and not 0 <= self.static_probability <= 1:
             raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
-
-    def step_weight(self, steps: int) -> float:
-        """Weight of the losses of one of ``steps`` predicted steps."""
-        return 1.0 / steps if self.over_steps == "mean" else 1.0
 
     def static_chance(self, steps: int) -> float:
         """Probability of the static loss in a batch of ``steps`` predicted steps."""

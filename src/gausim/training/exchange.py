@@ -10,7 +10,6 @@ from torch.nn import Parameter
 
 from gausim.nn.normaliser import normalisers_of
 from gausim.training.ranks.ranks import Ranks
-from gausim.training.statistics import Statistics
 
 
 class Exchange:
@@ -31,24 +30,15 @@ class Exchange:
         self._begun = True
 
     @torch.no_grad()
-    def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], statistics: Statistics) -> None:
-        """Adds the ranks' loss gradients and normaliser sums; a weight that no rank's sequences use keeps no gradient.
-
-        The ``pulls`` in ``statistics``, gradients of the ``network``, are added as well, and their ratio is computed.
-        """
-        if self._ranks.size > 1:
-            gathered = self._gathered()
-            pull = weights[0].new_zeros(sum(p.numel() for p in network))
-            mine: list[Tensor | None] = [*(p.grad for p in weights), *gathered, *(statistics.pulls or (None, None))]
-            total = self._ranks.add(mine, [*weights, *gathered, pull, pull])
-            for weight, gradient in zip(weights, total, strict=False):
-                weight.grad = gradient
-            _assign(gathered, total[len(weights) : -2])
-            images, momentum = total[-2:]
-            statistics.pulls = None if images is None or momentum is None else (images, momentum)
-        if statistics.pulls is not None:
-            by_images, by_momentum = (pull.norm() for pull in statistics.pulls)
-            statistics.gradient_fraction = by_momentum / (by_images + by_momentum).clamp_min(1e-30)
+    def step(self, weights: Sequence[Parameter]) -> None:
+        """Adds the ranks' loss gradients and normaliser sums; a weight that no sequence uses keeps no gradient."""
+        if self._ranks.size == 1:
+            return
+        gathered = self._gathered()
+        total = self._ranks.add([*(p.grad for p in weights), *gathered], [*weights, *gathered])
+        for weight, gradient in zip(weights, total, strict=False):
+            weight.grad = gradient
+        _assign(gathered, total[len(weights) :])
 
     def absorb(self) -> None:
         """Updates the statistics with normaliser sums that are added already."""

@@ -18,7 +18,7 @@ from gausim.render.draw import draw
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.graphed import GraphedRollouts
-from gausim.training.method import Method
+from gausim.training.method import SharedSimulator
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
 from gausim.training.rollout import States, windows
@@ -34,14 +34,13 @@ class Learner(nn.Module):
         images: supervision by images, also used to render predictions.
         diagonals: diagonals of the scenes [scene units].
         barren: number of successive steps without a usable stretch.
-        measuring: whether this step measures the momentum loss's gradient fraction.
         shown: sequences of the last step.
     """
 
     def __init__(
         self,
         *,
-        method: Method,
+        method: SharedSimulator,
         renderer: Renderer,
         objective: Objective | None = None,
         optimizer: OptimizerSettings | None = None,
@@ -58,7 +57,7 @@ class Learner(nn.Module):
         self.images.begins = self._begins
         self.supervision: Supervision = self.images if supervision is None else supervision
         self.baselines = Baselines(self.supervision)
-        self.ranks, self.barren, self.shown, self.measuring = Ranks(), 0, 0, False
+        self.ranks, self.barren, self.shown = Ranks(), 0, 0
         self.exchange = Exchange(self.ranks, method.model)
 
     @property
@@ -76,7 +75,7 @@ class Learner(nn.Module):
         return self.method.groups()
 
     def configure_optimizers(self) -> Any:
-        """One optimiser over all groups; None without trainable parameters.
+        """One optimiser over all groups.
 
         Raises:
             ConfigError: a parameter is in no group.
@@ -91,14 +90,6 @@ class Learner(nn.Module):
         """Adds the gradients of a loss, if there are trainable parameters."""
         if loss.requires_grad:
             loss.backward()
-
-    def defers(self, device: torch.device) -> bool:
-        """Whether reading a value would block the host; such reads are deferred to the end of the step."""
-        return self.method.defers and device.type != "cpu"
-
-    def network(self) -> list[nn.Parameter]:
-        """Trainable weights of the network."""
-        return [p for p in self.groups().get("network", []) if p.requires_grad]
 
     def baseline(self, sample: SequenceSample) -> SequenceBaseline:
         """Baseline metrics of a sample's sequence, for at least the sample's frames."""

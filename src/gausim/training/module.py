@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
 
+from gausim.core import GaussianScene
 from gausim.data.dataset import SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.runs.checkpoint import check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
-from gausim.training.method import Moment
+from gausim.training.optimizers import set_rates
 from gausim.training.plan import TrainingPlan
-from gausim.training.statistics import Baselines
 from gausim.training.step import OptimiserStep
 from gausim.training.supervision.motion_tracks import TrackSupervision
 from gausim.training.warm_start import warm_start
@@ -35,25 +35,27 @@ class GausSimModule(OptimiserStep, LightningModule):
     a single rank.
     """
 
-    def __init__(
-        self, *, plan: TrainingPlan | None = None, seed: int = 0, fraction_every: int = 50, **parts: Any
-    ) -> None:
+    def __init__(self, *, plan: TrainingPlan | None = None, seed: int = 0, **parts: Any) -> None:
         """Stores the ``parts`` of a :class:`~gausim.training.learner.Learner`.
 
         Args:
             plan: the resolved plan; constant rates when None.
             seed: seed of each step's random numbers (static loss, free motion), together with the step's number.
-            fraction_every: optimiser steps between measurements of the momentum loss's gradient fraction; 0 is never.
             parts: arguments of the learner.
         """
         super().__init__(**parts)
         self.automatic_optimization = False
-        self.seed, self.fraction_every, self.measuring = seed, fraction_every, bool(fraction_every)
+        self.seed = seed
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
         self.plan, self.minutes = plan or TrainingPlan(schedule=None, warm_start=None), 0.0
         self._sums: dict[str, list[float]] = {}
-        self._warned, self.cost = not self.method.warns, TrainingCost()
+        self._warned, self.cost = False, TrainingCost()
+
+    @property
+    def scenes(self) -> Sequence[GaussianScene]:
+        """The rest scenes; their index is the ``scene_id`` of samples."""
+        return self.simulator.scenes
 
     @property
     def method_name(self) -> str:
@@ -62,13 +64,13 @@ class GausSimModule(OptimiserStep, LightningModule):
 
     @property
     def footnotes(self) -> dict[str, Any]:
-        """Whether the method extrapolates, notes on its figures, and the cost of training."""
+        """That the method extrapolates, notes on its figures, and the cost of training."""
         fit = self.cost.summary() if self.cost.seconds else None
-        return {"extrapolates": self.method.extrapolates, "notes": self.notes(), "fit": fit}
+        return {"extrapolates": True, "notes": self.notes(), "fit": fit}
 
     def notes(self) -> list[str]:
-        """Notes on the figures, in sentences; without training costs where the method is not trained."""
-        return self.method.notes() + (self.cost.notes() if self.method.learns else [])
+        """Notes on the figures, in sentences."""
+        return self.cost.notes()
 
     # ------------------------------------------------------------------------------------------------ one step
 
@@ -77,17 +79,12 @@ class GausSimModule(OptimiserStep, LightningModule):
         optimizer, trainer = cast(Any, self.optimizers()), self.trainer
         batches = float(trainer.num_training_batches)
         done = self.plan.progress(self.current_epoch + batch_idx / max(1.0, batches), self.minutes)
-        now = Moment(batch_idx, batches, done)
-        task = self.method.begin_step(optimizer.optimizer, self.settings, self.plan, now)
-        if task.is_new:
-            self.baselines = Baselines(self.supervision)
-        if task.objective is not None:
-            self.objective, self.images.loss = task.objective, task.objective.image
-        self.settings = task.settings or self.settings
-        self.measuring = bool(self.fraction_every) and self.global_step % self.fraction_every == 0
+        shared = getattr(self.model, "shared_groups", ("network",))
+        set_rates(optimizer.optimizer, lambda name: self.plan.rate_factor(name, done, shared=name in shared))
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
-        self._record({**stats, "lr": task.rate}, self.shown)
+        rate = self.settings.network_lr * self.plan.rate_factor("network", done)
+        self._record({**stats, "lr": rate}, self.shown)
         self._look_at_the_clock()
         if self.plan.time_fraction(self.minutes) >= 1:
             trainer.should_stop = True
@@ -134,7 +131,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         self._sums.clear()
 
     def on_train_epoch_end(self) -> None:
-        """Computes the epoch's means, warns of a collapse, and lets the method prepare the next epoch."""
+        """Computes the epoch's means and warns of a collapse."""
         self.summary = self.epoch_means()
         row = {f"epoch/{name}": value for name, value in self.summary.items()}
         for logger in self.trainer.loggers:  # not log_dict: Lightning would write it after the epoch's checkpoint
@@ -148,8 +145,6 @@ class GausSimModule(OptimiserStep, LightningModule):
                 "optimizer.initial_lr or use loss.backprop_steps > 1.",
                 stacklevel=2,
             )
-        if self.method.end_epoch(self.plan.time_fraction(self.minutes)):
-            self.trainer.should_stop = True
 
     # ------------------------------------------------------------------------------------------------ checkpoints
 
@@ -160,7 +155,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         own["baselines"] = self.baselines.state_dict()
         if isinstance(self.supervision, TrackSupervision):
             own["tracks"] = self.supervision.state_dict()
-        checkpoint["gausim"], checkpoint["cost"] = {**own, **self.method.state_dict()}, self.cost.state_dict()
+        checkpoint["gausim"], checkpoint["cost"] = own, self.cost.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint of other scenes; restores what :meth:`on_save_checkpoint` added.
@@ -177,9 +172,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         self.baselines.load_state_dict(own["baselines"])
         if isinstance(self.supervision, TrackSupervision):
             self.supervision.load_state_dict(own.get("tracks", {}))
-        self.method.load_state_dict(own)
 
     def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
         """Restores from a checkpoint what :attr:`footnotes` needs."""
-        self.method.take_notes(checkpoint["gausim"])
         self.cost.load_state_dict(checkpoint["cost"])

@@ -1,4 +1,4 @@
-"""Statistics of an optimiser step: stored on the device, read at once, joined over ranks, checked and compared.
+"""Figures of an optimiser step: measured on the device, joined over ranks, checked and compared.
 
 They are compared with the baseline metrics of each training sequence: the static prediction's losses, and the squared
 change of the truth.
@@ -6,23 +6,20 @@ change of the truth.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import DivergenceError
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.training.ranks.ranks import interleave
-from gausim.training.rollout import check_reach, describe
+from gausim.training.rollout import describe
 from gausim.training.supervision.images import Supervision
 
 Table = list[list[float]]
-# Measured in every stretch, and at most once per step.
-SERIES, SINGLE = ("reach", "images", "momentum", "motion"), ("static", "growth", "gradient_fraction")
 
 
 @dataclass
@@ -33,6 +30,16 @@ class SequenceBaseline:
     static: list[float] = field(default_factory=list)  # loss of the rest state on frames 1, 2, ..
     # squared change of the truth from frame t to t + 1 (images: summed over pixels)
     motion: list[float] = field(default_factory=list)
+
+    def extend(self, supervision: Supervision, sample: SequenceSample, rest: Tensor) -> None:
+        """Measures the frames of a sample that are not known yet; ``rest`` are its rest positions."""
+        seen = len(self.static)
+        if seen < sample.steps:
+            losses, motion = supervision.static(sample, rest, seen)
+            if seen == 0 and len(sample.cameras.names):  # true points have no error of a reconstruction
+                self.floor = losses[0]
+            self.static += losses[1:]
+            self.motion += motion
 
 
 def excess(loss: float, static: float, floor: float) -> float:
@@ -55,13 +62,7 @@ class Baselines:
         known = SequenceBaseline()
         if not sample.start:
             known = self._known.setdefault(sample.sequence_id, known)
-        seen = len(known.static)
-        if seen < sample.steps:
-            losses, motion = self._supervision.static(sample, rest, seen)
-            if seen == 0 and len(sample.cameras.names):  # true points have no error of a reconstruction
-                known.floor = losses[0]
-            known.static += losses[1:]
-            known.motion += motion
+        known.extend(self._supervision, sample, rest)
         return known
 
     def learn(self, samples: Sequence[SampleFacts], baselines: Sequence[SequenceBaseline]) -> None:
@@ -79,66 +80,36 @@ class Baselines:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Statistics of a step on the host."""
+class Measured:
+    """Figures of an optimiser step on the host."""
 
-    reach: list[Table]  # largest distance of a kernel from rest, per stretch, step and sequence [diagonals]
-    images: list[Table]  # image loss per stretch, step and sequence
-    momentum: list[list[float]]  # momentum loss per stretch and step, summed over sequences
-    motion: list[float]  # squared change of the predicted images per stretch, summed over sequences
+    images: Table  # image loss of each predicted frame and sequence
+    momentum: list[float]  # momentum loss of each frame, summed over sequences
+    motion: float  # squared change of the predicted images, summed over frames and sequences
     static: float | None  # the static loss of this rank's scenes, if the batch had this term
     growth: float | None  # energy growth of free motion, this rank's part of the mean, if measured
-    # the momentum loss's fraction of the network's loss gradient, if measured; equal on all ranks
-    gradient_fraction: float | None
     gradients: dict[str, float]  # norm of each parameter group's loss gradient; equal on all ranks
 
     @staticmethod
-    def join(parts: Sequence[Found]) -> Found:
-        """The statistics that one rank with all sequences would have."""
+    def join(parts: Sequence[Measured]) -> Measured:
+        """The figures that one rank with all sequences would have."""
         if len(parts) == 1:
             return parts[0]
-        held = [part for part in parts if part.reach]  # the others had no sequence
-        reach, images, momentum, motion = (
-            list(zip(*(getattr(part, name) for part in held), strict=True)) for name in SERIES
+        held = [part for part in parts if part.images]  # the others had no sequence
+        images = [interleave(rows) for rows in zip(*(part.images for part in held), strict=True)]
+        momentum = [sum(values) for values in zip(*(part.momentum for part in held), strict=True)]
+        static, growth = (
+            sum(known) if (known := [v for part in parts if (v := getattr(part, name)) is not None]) else None
+            for name in ("static", "growth")
         )
-        joined: dict[str, Any] = {"motion": list(map(sum, motion))}
-        joined["momentum"] = [[sum(values) for values in zip(*lists, strict=True)] for lists in momentum]
-        for name, stretches in (("reach", reach), ("images", images)):
-            joined[name] = [[interleave(rows) for rows in zip(*tables, strict=True)] for tables in stretches]
-        for name in ("static", "growth"):
-            known = [value for part in parts if (value := getattr(part, name)) is not None]
-            joined[name] = sum(known) if known else None
-        return replace(parts[0], **joined)
+        return Measured(images, momentum, sum(part.motion for part in held), static, growth, parts[0].gradients)
 
-    @property
-    def frames(self) -> Table:
-        """Image loss of each predicted frame and sequence."""
-        return [row for table in self.images for row in table]
-
-    def lasting(self, samples: Sequence[SampleFacts], explosion: float) -> Found:
-        """Ends the rollout of the samples at its first explosion and checks that all values are finite.
-
-        A stretch in which a kernel moves further than ``explosion`` [diagonals] is left out.
-
-        Raises:
-            DivergenceError: a value is not finite; names the step and the sequence, if it has one.
-        """
-        start = lasted = 0
-        for table in self.reach:
-            if check_reach(table, start, samples) > explosion:
-                break
-            start, lasted = start + len(table), lasted + 1
-        fraction = self.gradient_fraction if lasted else None  # of the first stretch
-        found = replace(self, **{name: getattr(self, name)[:lasted] for name in SERIES}, gradient_fraction=fraction)
-        found._check(samples)
-        return found
-
-    def _check(self, samples: Sequence[SampleFacts]) -> None:
-        momentum = [value for values in self.momentum for value in values]
+    def check(self, samples: Sequence[SampleFacts]) -> None:
+        """Raises DivergenceError where a value is not finite; names the step and the sequence, if it has one."""
         checked: list[tuple[float, int | None, SampleFacts | None, str]] = []
-        for t, row in enumerate(self.frames):
+        for t, row in enumerate(self.images):
             checked += [(v, t, sample, "the image loss") for v, sample in zip(row, samples, strict=True)]
-            checked.append((momentum[t], t, None, "the momentum loss"))
+            checked.append((self.momentum[t], t, None, "the momentum loss"))
         checked.append((self.static or 0.0, None, None, "the static loss"))
         checked += [(v, None, None, f"the gradient of group '{name}'") for name, v in self.gradients.items()]
         for value, step, sample, what in checked:
@@ -147,51 +118,42 @@ class Found:
 
     def stats(self, steps: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
         """Logged metrics of a step of T = ``steps`` predicted frames, from the baselines of its sequences."""
-        frames, count = self.frames, len(baselines)
-        single = {
-            "momentum_share": self.gradient_fraction, "loss_static": self.static, "energy_growth": self.growth,
-        }  # fmt: skip
+        frames, count = self.images, len(baselines)
+        single = {"loss_static": self.static, "energy_growth": self.growth}
         stats = {f"grad_{name}": value for name, value in self.gradients.items()}
         stats.update({name: value for name, value in single.items() if value is not None})
         stats.update(steps=float(steps), exploded=float(len(frames) < steps))
         if frames:
-            stats["loss_momentum"] = sum(value for values in self.momentum for value in values) / (steps * count)
+            stats["loss_momentum"] = sum(self.momentum) / (steps * count)
             stats["loss_image"] = sum(map(sum, frames)) / (len(frames) * count)
-            stats.update(_compare(frames, sum(self.motion), baselines))
+            stats.update(relative(frames, self.motion, baselines))
         return stats
 
 
 @dataclass
 class Statistics:
-    """Statistics of an optimiser step on the device, by stretch; :class:`Found` explains the attributes."""
+    """Figures of an optimiser step on the device, by stretch; :class:`Measured` explains them."""
 
-    reach: list[Float[Tensor, "T S"]] = field(default_factory=list)
     images: list[Float[Tensor, "T S"]] = field(default_factory=list)
     momentum: list[Float[Tensor, " T"]] = field(default_factory=list)
     motion: list[Float[Tensor, ""]] = field(default_factory=list)
     static: Float[Tensor, ""] | None = None
     growth: Float[Tensor, ""] | None = None
-    # the network's gradients of the image losses and of the momentum loss, where their ratio is measured
-    pulls: tuple[Float[Tensor, " P"], Float[Tensor, " P"]] | None = None
-    gradient_fraction: Float[Tensor, ""] | None = None
 
-    def fetch(self, norms: Mapping[str, Tensor]) -> Found:
-        """Copies all statistics and the norms of the parameter groups' loss gradients to the host at once."""
-        parts = [x for name in SERIES for x in getattr(self, name)]
-        parts += [x for x in (*(getattr(self, name) for name in SINGLE), *norms.values()) if x is not None]
-        device = parts[0].device
-        numbers = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
-        found: dict[str, Any] = {name: [_take(x.shape, numbers) for x in getattr(self, name)] for name in SERIES}
-        found |= {name: None if getattr(self, name) is None else next(numbers) for name in SINGLE}
-        return Found(**found, gradients=dict(zip(norms, numbers, strict=True)))
-
-
-def _take(shape: Sequence[int], numbers: Iterator[float]) -> Any:
-    """Nested lists of a shape, filled from ``numbers``."""
-    return [_take(shape[1:], numbers) for _ in range(shape[0])] if shape else next(numbers)
+    def fetch(self, norms: Mapping[str, Tensor]) -> Measured:
+        """Copies the figures and the norms of the parameter groups' loss gradients to the host."""
+        static, growth = (None if value is None else float(value) for value in (self.static, self.growth))
+        return Measured(
+            [row for table in self.images for row in table.tolist()],
+            [value for values in self.momentum for value in values.tolist()],
+            sum(float(value) for value in self.motion),
+            static,
+            growth,
+            {name: float(norm) for name, norm in norms.items()},
+        )
 
 
-def _compare(frames: Table, motion: float, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
+def relative(frames: Table, motion: float, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
     """Losses relative to those of the static prediction, and motion energy relative to the truth."""
     floor = static = first = moved = 0.0
     for baseline in baselines:

@@ -81,21 +81,6 @@ class AnchoredMotion(Fitted):
         return {"velocity": list(self.velocity)}
 
 
-class ConstantVelocity(AnchoredMotion):
-    """Every anchor keeps the velocity that was fitted to the first frames; there are no forces."""
-
-    name = "constant_velocity"
-
-    def notes(self) -> tuple[str, ...]:
-        """The origin of the velocity."""
-        return ("Every anchor keeps the velocity that was fitted to the frames of the only stage.",)
-
-    def advance(self, state: FittedState) -> FittedState:
-        """The next frame: x + v."""
-        x, v = state.inner
-        return self.state(state.sequence_id, state.frame + 1, x + v, v)
-
-
 class SpringMass(AnchoredMotion):
     """Spring-Gaus: anchors of mass 1 joined by springs, without gravity, pinned where the object is.
 

@@ -26,7 +26,7 @@ class EpochSummary(Callback):
 
     COLUMNS = (
         "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "ratio_first",
-        "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network",
+        "motion_energy", "loss_momentum", "loss_static", "energy_growth", "grad_network",
         "grad_scene", "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
     )  # fmt: skip
@@ -74,7 +74,6 @@ class EpochSummary(Callback):
         labels = {
             "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
             "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
-            "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
         if means.get("exploded", 0) > 0:

@@ -60,14 +60,6 @@ class Ranks:
             raise RunError(f"rank {self.rank}: the first rank stopped ({answer[1]}).")
         return answer[0]
 
-    def everywhere(self, flag: Tensor) -> Tensor:
-        """Whether a boolean tensor on the device is true on all ranks; the host does not wait for it."""
-        if self.size == 1:
-            return flag
-        least = flag.to(torch.int32)
-        dist.all_reduce(least, dist.ReduceOp.MIN)
-        return least.bool()
-
     def add(self, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[Tensor | None]:
         """Sums of tensors over ranks, one message per data type; the same bits on every rank.
 

@@ -35,7 +35,3 @@ class StepInputs:
     objective: Objective
     images: ImageSupervision
     diagonals: Sequence[float]
-
-
-# Makes the backward pass of a term, for the mean over all sequences of the step.
-Term = Callable[[StepInputs], None]

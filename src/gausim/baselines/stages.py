@@ -119,36 +119,7 @@ class FitPlan:
         name, stage = order[0]
         return name, stage, min(float(stage.iterations), rest * self.shows)
 
-
-class StagedCurriculum:
-    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the largest T."""
-
-    def __init__(self, plan: FitPlan, t_max: int, batch_size: int = 1) -> None:
-        self.plan, self.t_max, self.batch_size, self.repeats = plan, t_max, batch_size, plan.shows
-        self._state: dict[str, float] = {}
-        self.enter(0.0)
-
-    @property
-    def position(self) -> float:
-        """Position in the plan at the beginning of the current epoch [epochs of the plan]."""
-        return self._state["position"]
-
-    def enter(self, position: float) -> None:
-        """Sets stage and T of the next epoch."""
-        steps = self.t_max
-        if self.plan.order:
-            _, stage, done = self.plan.place(position)
-            steps = stage.steps(done / max(1.0, stage.iterations - self.plan.shows), self.t_max)
-        self._state.update(position=position, steps=float(steps))
-
-    def steps(self, epoch: int) -> int:
-        """Predicted steps T of the current epoch; its number is not used."""
-        return int(self._state["steps"])
-
-    def state_dict(self) -> dict[str, float]:
-        """The position in the plan."""
-        return dict(self._state)
-
-    def load_state_dict(self, state: Mapping[str, float]) -> None:
-        """Restores the position in the plan."""
-        self._state.update(state)
+    def steps(self, epochs: float, most: int) -> int:
+        """Predicted frames T after ``epochs`` epochs of the plan; ``most`` is the number of training frames."""
+        _, stage, done = self.place(epochs)
+        return stage.steps(done / max(1.0, stage.iterations - self.shows), most)

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
+from gausim.baselines.stages import FitPlan, Stage
 from gausim.core import ConfigError
 from gausim.losses.mixed import MixedLoss
 from gausim.nn.schedules import ExponentialSchedule, HalvingSchedule, LinearSchedule
-from gausim.training.fitted.stages import FitPlan, Stage, StagedCurriculum
 
 
 def stage(iterations: int = 10, **options: object) -> Stage:
@@ -27,16 +27,7 @@ def test_epochs_walk_through_the_stages() -> None:
 
 def test_the_window_grows_from_the_first_to_the_last_epoch_of_a_stage() -> None:
     plan = FitPlan({"few": stage(5, frames=[2, 2]), "more": stage(20, frames=[4, 0])}, round=5)
-    curriculum = StagedCurriculum(plan, t_max=10)
-    seen = []
-    for epoch in range(5):
-        curriculum.enter(float(epoch))
-        seen.append(curriculum.steps(epoch))
-    assert seen == [2, 4, 6, 8, 10]
-    other = StagedCurriculum(plan, t_max=10)
-    other.load_state_dict(curriculum.state_dict())
-    assert other.steps(0) == 10 and other.position == 4
-    assert StagedCurriculum(FitPlan(), t_max=3).steps(0) == 3
+    assert [plan.steps(float(epoch), 10) for epoch in range(5)] == [2, 4, 6, 8, 10]
 
 
 def test_rates_follow_their_groups_schedule() -> None:
