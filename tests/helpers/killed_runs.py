@@ -8,7 +8,6 @@ backward pass: after one, torch refuses to fork.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import pydoc
 import random
@@ -18,6 +17,7 @@ import signal
 import sys
 import tempfile
 import traceback
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,8 +35,8 @@ def die_at(target: str, match: str, count: int, when: str, rank: int = 0, by: st
     """Ends a rank by a signal before or after our count-th call of ``target`` with ``match`` in its arguments."""
 
     def kill() -> None:
-        others = sorted(multiprocessing.active_children(), key=lambda process: process.pid)
-        os.kill(others[rank - 1].pid if rank else os.getpid(), signal.Signals[by])
+        others = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+        os.kill(int(sorted(others, key=int)[rank - 1]) if rank else os.getpid(), signal.Signals[by])
 
     home, name = target.rsplit(".", 1)
     owner = pydoc.locate(home)

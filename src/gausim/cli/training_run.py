@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 
 from gausim.cli.output import end
@@ -17,7 +16,7 @@ from gausim.cli.sweeps.jobs import do_job
 from gausim.compose.build import is_pretrained, open_data, with_resolved_plan
 from gausim.compose.command import run_dir
 from gausim.compose.root import in_sweep
-from gausim.compose.train import plain
+from gausim.compose.train import is_first, plain
 from gausim.compose.train import train as train_run_directory
 from gausim.core import RunError
 from gausim.doctor.examine import examine
@@ -55,9 +54,9 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
 
 def _trained(cfg: DictConfig, run: RunDirectory) -> dict[str, Any]:
     """Trains the run and prints its result; returns its facts."""
-    faults = _warn_of_data(cfg) if cfg.doctor and not in_sweep() and _is_first() else []
+    faults = _warn_of_data(cfg) if cfg.doctor and not in_sweep() and is_first() else []
     facts = train_run_directory(cfg, run)
-    if _is_first():
+    if is_first():
         if faults:
             facts["data_faults"] = faults
             run.finish(facts)
@@ -66,13 +65,9 @@ def _trained(cfg: DictConfig, run: RunDirectory) -> dict[str, Any]:
     return facts
 
 
-def _is_first() -> bool:
-    return not getattr(rank_zero_only, "rank", 0)
-
-
 def _evaluate(run: RunDirectory) -> None:
     """`gausim evaluate RUN` in a separate process, so that it measures time and memory of predictions alone."""
-    if not _is_first():
+    if not is_first():
         return
     part = run.config()["data"].get("part")
     command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path), *["--test"] * (part == "test")]

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import torch
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.baselines.fitting import FittedModule, fit
@@ -23,7 +24,8 @@ from gausim.runs.names import EPOCHS
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.material_scan import find_materials
 from gausim.training.module import GausSimModule
-from gausim.training.ranks.launch import Crew
+from gausim.training.ranks.launch import joined
+from gausim.training.ranks.ranks import Ranks
 from gausim.training.table import Table
 from gausim.training.trainer import TrainerSettings, make_trainer
 from gausim.training.transfer import load_shared, load_simulator, unlike
@@ -52,11 +54,13 @@ def train(cfg: DictConfig, run: RunDirectory) -> dict[str, Any]:
     Raises:
         GausSimError: the run is finished, has another configuration or is damaged, or training diverged.
     """
-    with run.recording_failure(), Crew(instantiate(cfg.trainer), follow) as crew:
-        if not crew.is_first:  # started by a scheduler beside the first rank
-            return follow(crew)
-        config = plain(cfg)
-        task = crew.ranks.first(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.overwrite)))
+    settings: TrainerSettings = instantiate(cfg.trainer)
+    with run.recording_failure(), joined(settings):
+        first, config = is_first(), plain(cfg)
+        if first or Ranks().size > 1:  # others that this process starts later find the directory prepared
+            resume = Ranks().first(lambda: run.prepare(config, overwrite=cfg.overwrite))
+        else:
+            resume = run.checkpoint_to_resume
         seed_everything(cfg.seed, workers=True, verbose=False)
         module, datamodule = build(cfg)
         check_protocol(cfg, datamodule)
@@ -65,30 +69,23 @@ def train(cfg: DictConfig, run: RunDirectory) -> dict[str, Any]:
                 f"ablation=joint: expected several objects, the data have {datamodule.objects[0].name} alone."
             )
         if isinstance(module, FittedModule):
-            facts = _fit(cfg, run, module, datamodule, task[2])
+            facts = _fit(cfg, run, module, datamodule, resume, settings)
         else:
-            _begin(cfg, module, datamodule, resumed=task[2] is not None)
-            crew.start(task)
-            facts = _train(cfg, run, module, datamodule, task[2], crew)
-        run.finish(facts)
+            _begin(cfg, module, datamodule, resumed=resume is not None)
+            facts = _train(cfg, run, module, datamodule, resume, settings)
+        if first:
+            run.finish(facts)
         return facts
+
+
+def is_first() -> bool:
+    """Whether this process is the rank that writes."""
+    return not getattr(rank_zero_only, "rank", 0)
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
     """The whole configuration in plain containers."""
     return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
-
-
-def follow(crew: Crew) -> dict[str, Any]:
-    """Trains as one of the other ranks, with the configuration of the first one and without writing files."""
-    task: Any = crew.ranks.first(lambda: None)
-    config, path, resume = task
-    cfg = OmegaConf.create(config)
-    seed_everything(cfg.seed, workers=True, verbose=False)
-    module, datamodule = build(cfg)
-    assert isinstance(module, GausSimModule)
-    _begin(cfg, module, datamodule, resumed=resume is not None)
-    return _train(cfg, RunDirectory(path), module, datamodule, resume, crew)
 
 
 def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
@@ -114,10 +111,10 @@ def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
 
 
 def _fit(
-    cfg: DictConfig, run: RunDirectory, module: FittedModule, datamodule: ReadyDataModule, resume: Path | None
-) -> dict[str, Any]:
+    cfg: DictConfig, run: RunDirectory, module: FittedModule, datamodule: ReadyDataModule, resume: Path | None,
+    settings: TrainerSettings,
+) -> dict[str, Any]:  # fmt: skip
     """Fits a method stage by stage, on one rank."""
-    settings: TrainerSettings = instantiate(cfg.trainer)
     if settings.size != 1:
         raise ConfigError(f"trainer.devices: {module.method_name} is fitted by one rank; expected 1.")
     _take_over(cfg, module, resumed=resume is not None)
@@ -176,17 +173,16 @@ def _begin(cfg: DictConfig, module: GausSimModule, datamodule: ReadyDataModule, 
 
 def _train(
     cfg: DictConfig, run: RunDirectory, module: GausSimModule, datamodule: ReadyDataModule, resume: Path | None,
-    crew: Crew,
+    settings: TrainerSettings,
 ) -> dict[str, Any]:  # fmt: skip
-    settings = instantiate(cfg.trainer)
     callbacks = settings.callbacks(has_videos=cfg.data._target_ != CORPUS)
-    wanted = (cfg.logger or {}).items() if crew.is_first else ()
+    wanted = (cfg.logger or {}).items() if is_first() else ()
     loggers = [instantiate(n, save_dir=str(run.path), **FOLDERS.get(str(k), {})) for k, n in wanted if n]
     epochs = module.plan.epochs or 1
-    trainer = make_trainer(settings, epochs=epochs, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
+    trainer = make_trainer(settings, epochs=epochs, run_dir=run.path, callbacks=callbacks, loggers=loggers)
     for logger in trainer.loggers:
         logger.log_hyperparams(plain(cfg))
-    if crew.is_first:
+    if is_first():
         datamodule.setup("fit")
         place = str(trainer.strategy.root_device)
         ranks = f"{trainer.world_size} ranks, " if trainer.world_size > 1 else ""
@@ -198,7 +194,7 @@ def _train(
         run.has_stepped = module.global_step > 0
     if trainer.interrupted:
         raise KeyboardInterrupt
-    return _facts(trainer, module) if crew.is_first else {}
+    return _facts(trainer, module) if is_first() else {}
 
 
 def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:

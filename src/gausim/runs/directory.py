@@ -139,6 +139,11 @@ class RunDirectory:
         self._prepared = True
         return resume
 
+    @property
+    def checkpoint_to_resume(self) -> Path | None:
+        """The checkpoint that a prepared run continues from, for ranks that follow the first one."""
+        return next(filter(Path.is_file, (self.checkpoint, self.path / PREVIOUS_CHECKPOINT)), None)
+
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
         """Compares the configuration of this run with another one.
 

@@ -14,8 +14,8 @@ from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
 from gausim.runs.cost import keep_freed_memory
 from gausim.training.callbacks.resume import ExactResume, RunCheckpoint
-from gausim.training.ranks.launch import Crew
-from gausim.training.ranks.layout import Layout, RanksStrategy
+from gausim.training.ranks.launch import RanksStrategy
+from gausim.training.ranks.layout import Layout
 
 
 @dataclass(frozen=True)
@@ -50,20 +50,18 @@ def make_trainer(
     run_dir: Path | None = None,
     callbacks: Sequence[Callback] = (),
     loggers: Sequence[Logger] = (),
-    crew: Crew | None = None,
 ) -> Trainer:
     """The Lightning trainer of a run of ``epochs``, those of the module's plan.
 
-    Files go to ``run_dir``; the ``crew`` has the ranks, if there are several.
+    Files go to ``run_dir``, which several ranks need.
 
     Raises:
-        ConfigError: more than one rank without a crew.
+        ConfigError: more than one rank without a run directory.
     """
-    environment = crew.environment if crew is not None else None
-    if settings.size != 1 and environment is None:
+    if settings.size != 1 and run_dir is None:
         raise ConfigError(
-            f"trainer.devices: expected 1, got {settings.devices} on {settings.num_nodes} machines; several ranks "
-            "train by `gausim train` only, which starts them."
+            f"trainer.devices: expected 1 without a run directory, whose configuration other ranks read, got "
+            f"{settings.size}."
         )
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
@@ -73,7 +71,7 @@ def make_trainer(
         accelerator=settings.accelerator,
         devices=settings.devices,
         num_nodes=settings.num_nodes,
-        strategy="auto" if environment is None else RanksStrategy(),
+        strategy="auto" if settings.size == 1 or run_dir is None else RanksStrategy(settings, run_dir),
         logger=list(loggers) or False,
         callbacks=[*callbacks, ExactResume()],
         log_every_n_steps=settings.log_every_n_steps,
@@ -83,5 +81,5 @@ def make_trainer(
         limit_val_batches=0,
         use_distributed_sampler=False,  # our sampler divides the batches
         default_root_dir=None if run_dir is None else str(run_dir),
-        plugins=[AtomicCheckpointIO(), *([] if environment is None else [environment])],
+        plugins=[AtomicCheckpointIO()],
     )

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch import distributed as dist
 
-from gausim.core import GausSimError, RunError
+from gausim.core import RunError
 
 T = TypeVar("T")
 
@@ -94,10 +94,3 @@ def interleave(slices: Sequence[Sequence[T]]) -> list[T]:
     """A step's sequences in order, from the ranks' slices: rank r has items r, r + ranks, r + 2 ranks, ..."""
     length = max(map(len, slices))
     return [rank_slice[i] for i in range(length) for rank_slice in slices if i < len(rank_slice)]
-
-
-def is_lost_connection(error: BaseException) -> bool:
-    """Whether an error means that another rank has ended or did not answer in time."""
-    if isinstance(error, GausSimError):
-        return False
-    return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error).lower())
