@@ -17,6 +17,7 @@ from gausim.runs.checkpoint import (
     check_scenes,
     digest,
     fingerprints,
+    load_weights,
     read_checkpoint,
 )
 from gausim.runs.directory import RunDirectory

@@ -106,7 +106,7 @@ def test_weights_that_drift_apart_are_noticed(ask: Ask) -> None:
 
 
 def test_wrong_layouts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    for wrong in ({"devices": 0}, {"num_nodes": 0}, {"timeout_minutes": 0.0}):
+    for wrong in ({"devices": 0}, {"num_nodes": 0}):
         with pytest.raises(ConfigError, match=r"trainer: expected devices >= 1"):
             Layout(**wrong)
     with pytest.raises(ConfigError, match=r"trainer.devices: expected 1 without a run directory"):

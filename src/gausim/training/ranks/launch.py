@@ -23,6 +23,8 @@ from gausim.training.ranks.layout import Layout
 
 # The program of the other ranks; its argument is the run directory.
 FOLLOWER = "gausim.compose.follow"
+# Longest that a rank waits for the others.
+TIMEOUT = timedelta(minutes=10)
 
 
 class FollowerLauncher(_SubprocessScriptLauncher):
@@ -68,7 +70,7 @@ class RanksStrategy(DDPStrategy):
     """
 
     def __init__(self, layout: Layout, run_dir: Path) -> None:
-        super().__init__(process_group_backend=layout.backend, timeout=timedelta(minutes=layout.timeout_minutes))
+        super().__init__(process_group_backend=layout.backend, timeout=TIMEOUT)
         self._layout, self._run_dir = layout, run_dir
 
     def _configure_launcher(self) -> None:
@@ -108,8 +110,8 @@ def joined(layout: Layout) -> Iterator[None]:
             raise
         words = (str(error) or type(error).__name__).splitlines()[0]
         raise RunError(
-            f"the connection to the other ranks is lost ({words}). One of them has ended or did not answer within "
-            "trainer.timeout_minutes; its output tells why. The last checkpoint, if any, is unharmed; the same command "
+            f"the connection to the other ranks is lost ({words}). One of them has ended or did not answer in "
+            "time; its output tells why. The last checkpoint, if any, is unharmed; the same command "
             "continues from it."
         ) from error
     finally:
@@ -150,5 +152,5 @@ def _check(layout: Layout) -> None:
         )
     dist.init_process_group(
         layout.backend, init_method=f"tcp://{environment.main_address}:{environment.main_port}",
-        rank=environment.global_rank(), world_size=layout.size, timeout=timedelta(minutes=layout.timeout_minutes),
+        rank=environment.global_rank(), world_size=layout.size, timeout=TIMEOUT,
     )  # fmt: skip

@@ -11,18 +11,17 @@ from gausim.core import ConfigError
 
 @dataclass(frozen=True)
 class Layout:
-    """Number of ranks (``devices`` are per machine), their devices and the time limit of their communication."""
+    """Number of ranks (``devices`` are per machine) and their devices."""
 
     devices: int = 1
     num_nodes: int = 1
     accelerator: str = "auto"
-    timeout_minutes: float = 10.0
 
     def __post_init__(self) -> None:
-        if not all(isinstance(n, int) and n >= 1 for n in (self.devices, self.num_nodes)) or self.timeout_minutes <= 0:
+        if not all(isinstance(n, int) and n >= 1 for n in (self.devices, self.num_nodes)):
             raise ConfigError(
-                "trainer: expected devices >= 1, num_nodes >= 1 (numbers of ranks and machines) and "
-                f"timeout_minutes > 0, got {self.devices!r}, {self.num_nodes!r} and {self.timeout_minutes!r}."
+                "trainer: expected devices >= 1 and num_nodes >= 1 (numbers of ranks and machines), got "
+                f"{self.devices!r} and {self.num_nodes!r}."
             )
 
     @property
