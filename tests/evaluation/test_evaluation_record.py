@@ -21,7 +21,7 @@ from gausim.metrics.lpips import expected_shapes
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.pictures import load_pictures
 from gausim.runs import cost
-from gausim.runs.cost import CostMeter, keep_freed_memory
+from gausim.runs.cost import CostMeter
 from gausim.runs.provenance import code_provenance
 
 
@@ -87,21 +87,6 @@ def test_the_first_sequence_warms_up(monkeypatch):
     only = CostMeter()
     only.predict(lambda: takes(50.0), 10)
     assert only.summary()["seconds_per_frame"]["mean"] == 5.0
-
-
-@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
-def test_memory_that_was_freed_before_hides_nothing():
-    def blocks(count: int) -> float:
-        return float(sum(x.sum() for x in [np.ones(125_000) for _ in range(count)]))  # 1 MB each
-
-    assert keep_freed_memory()
-    blocks(200)
-    meter = CostMeter()
-    for count in (150, 60, 80):
-        meter.predict(lambda count=count: blocks(count), 1)
-    memory = meter.summary()["memory"]
-    assert memory["peak_bytes"] > memory["first_added_bytes"]
-    assert 130e6 < memory["first_added_bytes"] < 200e6 and 65e6 < memory["added_bytes"] < 110e6
 
 
 def git(folder: Path, *arguments: str) -> str:

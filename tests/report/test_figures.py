@@ -4,9 +4,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers.report_runs import make_curves
 
-from gausim.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.pictures.figures import contact_sheet, picture_grid, slice_figure
 from gausim.pictures.frames import Timeline, moving_line, space_time_slice, video_frame
 
 
@@ -43,13 +42,6 @@ def test_video_frames_have_one_size_and_mark_what_is_foreseen():
     orange = (240, 150, 40)
     assert not (seen == orange).all(-1).any()
     assert (foreseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
-
-
-def test_error_figure_is_written(tmp_path):
-    error_figure(make_curves(), tmp_path / "new" / "errors.png", sequence="b")
-    image = read(tmp_path / "new" / "errors.png")
-    assert image.shape[1] > 1200  # three panels: 3D, training views, held-out views
-    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
 
 
 def test_slices_and_sheets_show_truth_and_prediction(tmp_path):

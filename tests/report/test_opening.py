@@ -56,16 +56,10 @@ def test_a_good_run_is_called_good():
 @pytest.mark.parametrize(
     ("sentence", "error", "seen", "energy", "words"),
     [
-        (0, 0.1, 0.1, 0.9, "it foresees the motion closely"),
         (0, 0.199, 0.1, 0.9, "it foresees most of the motion"),  # printed as 0.20
-        (0, 0.7, 0.3, 0.9, "it foresees part of the motion"),
         (0, 0.97, 0.5, 0.9, "no better than predicting no motion, although it learned the frames it was trained on"),
         (0, 1.4, 0.95, 0.9, "worse than predicting no motion, and it learned no more of the frames it was trained on"),
-        (0, 1.4, None, 0.9, "that is worse than predicting no motion"),
-        (1, 0.9, 0.2, 0.02, "it all but stands still"),
-        (1, 0.4, 0.2, 0.6, "it dies down sooner than the object does"),
         (1, 0.95, 0.2, 1.0, "it moves as much as the object, but not as the object does"),
-        (1, 0.4, 0.2, 1.5, "it is livelier than the object"),
         (1, 2.0, 0.2, 7.0, "it gains energy that the object does not have"),
     ],
 )

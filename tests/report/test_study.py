@@ -176,8 +176,8 @@ def test_why_there_is_no_number(sweep):
 
 def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs():
     start = "gausim train experiment=tables/comparison"
-    jobs = [f"{start} method={m} seed={s} ++plan.clock=cpu paths.output_root=/x" for m in "ab" for s in (0, 1)]
-    jobs += [f"{start} method=c seed=0 ++plan.clock=cpu paths.output_root=/x", "gausim train model=m init_from=o/r"]
+    jobs = [f"{start} method={m} seed={s} ++plan.clock=cpu output_root=/x" for m in "ab" for s in (0, 1)]
+    jobs += [f"{start} method=c seed=0 ++plan.clock=cpu output_root=/x", "gausim train model=m init_from=o/r"]
     assert joined(jobs) == [
         f"gausim train -m {start[13:]} method=a,b seed=0,1 plan.clock=cpu",
         f"gausim train {start[13:]} method=c seed=0 plan.clock=cpu",
@@ -186,7 +186,7 @@ def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs():
     assert joined(
         ["gausim train -m 'data.sequences=[a,b]' seed=0,1", "gausim train 'data.sequences=[a,b]' seed=2"]
     ) == ["gausim train -m 'data.sequences=[a,b]' seed=0,1,2"]
-    assert joined(["gausim train paths.output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
+    assert joined(["gausim train output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
         "gausim train init_from=outputs/run", "not recorded",
     ]  # fmt: skip
 

@@ -141,23 +141,6 @@ def test_the_comparison_has_costs_and_every_method_its_notes(sweep: Path) -> Non
     assert rows["static"][2:] == ["1.000 (± 0.500)", "0", *[""] * 5]
 
 
-def test_ablations_stand_beside_the_full_model(sweep: Path) -> None:
-    grid = grids_of(sweep)["toy_bunny, ablations of gausim"]
-    assert [column.label for column in grid.columns] == [
-        "l2 [1e-3], seen", "l2 [1e-3], unseen", "l2 [1e-3], new view, unseen", "3D ÷ static, seen",
-        "3D ÷ static, unseen", "motion energy, unseen", "l2, unseen, against full [%]", "the same [σ]",
-    ][: len(grid.columns)]  # fmt: skip
-    assert [line.label for line in grid.lines] == ["gausim", "gausim w/o mass"]
-    assert shown(grid)["gausim w/o mass"][6] == "36.4"
-
-
-def test_errors_by_frames_ahead_are_a_table(sweep: Path) -> None:
-    grid = grids_of(sweep)["toy_bunny, 3D error [% of the diagonal] by frames after the last seen one"]
-    assert [column.label for column in grid.columns] == ["+1", "+2", "+5", "+10", "+20", "+30"]
-    # l2 of 1e-3 and 3e-3, five times that in unseen frames, of the two seeds 1 and 1.2 times that.
-    assert shown(grid)["gausim"][0] == "1.10 ± 0.14*" and shown(grid)["static"][0] == "4.00"
-
-
 def test_several_objects_have_a_summary(sweep: Path) -> None:
     assert summary(study_of(sweep).pivot) is None
     run = write_run(sweep / "other", config() | {"data": {"root": "/data/toy", "names": ["toy_cube"], "seed": 0}})
