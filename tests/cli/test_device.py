@@ -40,6 +40,12 @@ def test_a_gpu_that_is_not_there_is_one_sentence(monkeypatch, capsys) -> None:
         gausim.load("RUN", device="cuda")
 
 
+@pytest.mark.parametrize("command", ["simulate", "view"])
+def test_the_options_of_a_scene_are_refused_with_a_run(command: str, tmp_path: Path, capsys) -> None:
+    assert cli.main([command, str(tmp_path), "--pin", "below z=0.1", "--device", "cpu"]) == 2
+    assert "expected with" in capsys.readouterr().err
+
+
 def test_all_that_a_renderer_gets_is_on_the_device_of_the_motion() -> None:
     seen: list[torch.Tensor] = []
 

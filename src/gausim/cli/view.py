@@ -87,6 +87,8 @@ def _subject(arguments: argparse.Namespace) -> Subject:
     is_run, beside = arguments.what.is_dir(), None
     if arguments.beside is not None and not is_run:
         raise ConfigError("--beside: expected a RUN before it, got a scene. Give two runs of one object.")
+    if is_run and (arguments.pin or arguments.base):
+        raise ConfigError("--pin and --from: expected with a scene only. A run has its pins and its network.")
     if is_run:
         made = _of_run(arguments.what, arguments, arguments.objects)
     else:

@@ -43,17 +43,12 @@ class Unit(Checked, frozen=True):
         if self.level == 0:
             return Kernels((self.index,)).mask(scene, units)
         if self.level > len(units):
-            raise ConfigError(
-                f"selection of level {self.level}: '{scene.name}' has levels 0 to {len(units)} under this method. "
-                "Select kernels or a ball instead."
-            )
+            raise ConfigError(f"selection of level {self.level}: '{scene.name}' has levels 0 to {len(units)}.")
         unit = units[self.level - 1]
         chosen = unit == self.index
         if not bool(chosen.any()):
-            raise ConfigError(
-                f"selection of unit {self.index}: level {self.level} of '{scene.name}' has units 0 to "
-                f"{int(unit.max())}."
-            )
+            has = f"level {self.level} of '{scene.name}' has units 0 to {int(unit.max())}"
+            raise ConfigError(f"selection of unit {self.index}: {has}.")
         return chosen
 
 
@@ -74,9 +69,8 @@ class Kernels(Checked, frozen=True):
             ConfigError: an index exceeds the scene's kernels.
         """
         if self.numbers[-1] >= scene.count:
-            raise ConfigError(
-                f"selection of kernel {self.numbers[-1]}: '{scene.name}' has kernels 0 to {scene.count - 1}."
-            )
+            has = f"'{scene.name}' has kernels 0 to {scene.count - 1}"
+            raise ConfigError(f"selection of kernel {self.numbers[-1]}: {has}.")
         chosen = torch.zeros(scene.count, dtype=torch.bool, device=scene.means.device)
         chosen[list(self.numbers)] = True
         return chosen
@@ -97,11 +91,8 @@ class Ball(Checked, frozen=True):
         away = (scene.means.double() - scene.means.new_tensor(self.centre, dtype=torch.float64)).norm(dim=-1)
         chosen = scene.simulated & (away <= self.radius * scene.diagonal)
         if not bool(chosen.any()):
-            nearest = float(away[scene.simulated].min()) / scene.diagonal
-            raise ConfigError(
-                f"selection of a ball: no kernel of '{scene.name}' lies within {self.radius:g} diagonals of "
-                f"{self.centre}; the nearest is {nearest:.3g} diagonals away."
-            )
+            within = f"within {self.radius:g} diagonals of {self.centre}"
+            raise ConfigError(f"selection of a ball: no kernel of '{scene.name}' lies {within}.")
         return chosen
 
 
@@ -136,10 +127,8 @@ def selection_from_json(value: Any) -> Selected:
             return parse_kernels(text)
         case {"centre": centre, "radius": radius, **more} if not more:
             return Ball(centre, radius)
-    raise ConfigError(
-        'field \'on\': expected {"whole": true}, {"level": L, "unit": I}, {"kernels": "0-9, 12"} or '
-        f'{{"centre": [x, y, z], "radius": R}}, got {str(value)[:80]}.'
-    )
+    forms = '{"whole": true}, {"level": L, "unit": I}, {"kernels": "0-9, 12"} or {"centre": [x, y, z], "radius": R}'
+    raise ConfigError(f"field 'on': expected {forms}, got {str(value)[:80]}.")
 
 
 def parse_kernels(text: Any) -> Kernels:
