@@ -9,6 +9,7 @@ import torch
 from torch.optim import Optimizer
 
 from benchmarks.harness import Options, Row, medians, peak_saved_bytes
+from gausim.core import ConfigError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.kernels.operations import OPERATIONS, plain_forms
@@ -25,14 +26,20 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
 
     Raises:
         DataError: the data set is not there.
+        ConfigError: the model is fitted to one sequence after another.
     """
     from gausim.compose.build import build
     from gausim.compose.config import compose
 
     words = list(overrides or OVERRIDES)
     own, rival = compose(words), compose([*(w for w in words if not w.startswith("model")), RIVAL])
-    module, data = build(own)
-    return measure(options, module, data, {} if own.model == rival.model else {RIVAL: build(rival)[0]})
+    made = [build(config) for config in (own, rival)[: 1 if own.model == rival.model else 2]]
+    modules = [module for module, _ in made if isinstance(module, GausSimModule)]
+    if len(modules) < len(made):
+        raise ConfigError(
+            "benchmarks train: expected model=gausim or another that learns by batches, not a fitted one."
+        )
+    return measure(options, modules[0], made[0][1], {RIVAL: other for other in modules[1:]})
 
 
 @dataclass
@@ -50,7 +57,6 @@ class _Case:
         frames = range(steps + 1)
         samples = [data.index.sample(i, frames, v).to(options.device) for i, v in zip(chosen, views, strict=True)]
         module.to(options.device).train()
-        module.measuring = False  # gradient fractions are measured in every fiftieth step only
         module.objective = replace(module.objective, static_probability=0.0)
         optimizer = module.configure_optimizers()
         for group in optimizer.param_groups:
