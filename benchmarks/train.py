@@ -36,10 +36,8 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
     made = [build(config) for config in (own, rival)[: 1 if own.model == rival.model else 2]]
     modules = [module for module, _ in made if isinstance(module, GausSimModule)]
     if len(modules) < len(made):
-        raise ConfigError(
-            "benchmarks train: expected model=gausim or another that learns by batches, not a fitted one."
-        )
-    return measure(options, modules[0], made[0][1], {RIVAL: other for other in modules[1:]})
+        raise ConfigError("benchmarks train: expected a model that learns by batches, such as model=gausim.")
+    return measure(options, modules[0], made[0][1], dict(zip([RIVAL], modules[1:], strict=False)))
 
 
 @dataclass
