@@ -46,7 +46,7 @@ def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_th
 def test_two_ranks_learn_what_one_does(trainings: Trainings) -> None:
     status, output = trainings("both", *TWO, "plan.epochs=1")
     assert status == 0 and "training on cpu (2 ranks, 1 torch thread)" in output, output
-    assert output.count("epoch 1/1") == 1
+    assert output.count("Trained for 1 epochs") == 1
     status, output = trainings("alone", "trainer=cpu", "plan.batch_size=2", "plan.epochs=1")
     assert status == 0, output
     found, alone = (rows(trainings.run(name) / "epochs.csv") for name in ("both", "alone"))
@@ -91,6 +91,6 @@ def test_ranks_that_a_scheduler_has_started_meet_and_train(trainings: Trainings,
     ranks = [subprocess.Popen(command, env=env, **pipes) for env in environments]
     outputs = [rank.communicate(timeout=240)[0] for rank in ranks]
     assert [rank.returncode for rank in ranks] == [0, 0], outputs
-    assert "2 ranks" in outputs[0] and "epoch 3/3" in outputs[0] and "epoch" not in outputs[1]
+    assert "2 ranks" in outputs[0] and "Trained for 3 epochs" in outputs[0] and "Trained" not in outputs[1]
     found, expected = (read_checkpoint(r / "last.ckpt")["state_dict"] for r in (run, whole))
     assert digest(found) == digest(expected)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers.simulators import SMALLEST
 from helpers.toy_object import write_toy_object
+from helpers.toy_runs import rows
 
 from gausim.cli import train
 from gausim.compose.build import build
@@ -36,10 +37,11 @@ def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_check
     assert train.main([*common, "plan.epochs=2", f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
     printed = capsys.readouterr().out
     assert "warm start: 2 sequences tracked" in printed
-    first = float(printed.split("epoch 1/2")[1].split(" of static")[0].split()[-1])
+    first = float(rows(tmp_path / "whole/epochs.csv")[0]["excess_static"])
     bare = [*common[:-1], "plan.warm_start=null", "plan.epochs=1"]
     assert train.main([*bare, f"hydra.run.dir={tmp_path / 'bare'}"]) == 0
-    cold = float(capsys.readouterr().out.split("epoch 1/1")[1].split(" of static")[0].split()[-1])
+    capsys.readouterr()
+    cold = float(rows(tmp_path / "bare/epochs.csv")[0]["excess_static"])
     assert first < 0.5 * cold
     cut = f"hydra.run.dir={tmp_path / 'cut'}"
     with pytest.MonkeyPatch.context() as patch:
