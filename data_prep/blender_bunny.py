@@ -24,15 +24,9 @@ REVISION = 1
 
 
 def make_set(
-    mesh: Path,
-    out: Path,
-    plan: Plan,
-    connect: Callable[[], BlenderProcess],
-    *,
-    workers: int = 1,
-    overwrite: bool = False,
-    tick: Tick = silent,
-) -> dict[str, Any]:
+    mesh: Path, out: Path, plan: Plan, connect: Callable[[], BlenderProcess], *, workers: int = 1,
+    overwrite: bool = False, tick: Tick = silent,
+) -> dict[str, Any]:  # fmt: skip
     """Makes a set, all of it or nothing.
 
     Raises:

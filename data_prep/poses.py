@@ -16,7 +16,7 @@ from typing import Any
 
 from data_prep.capture.cameras.mapping import SCRATCH, MappingOptions, map_photos
 from data_prep.capture.cameras.output import PosedWriter, key_of, sequence_cameras, write_points
-from data_prep.capture.cameras.report import draw_cameras, failures, point_colors, reprojection
+from data_prep.capture.cameras.report import draw_cameras, point_colors, reprojection
 from data_prep.capture.cameras.sources import Material, Posed, Sources, from_model
 from data_prep.capture.cameras.world import WorldOptions, place
 from data_prep.common.command import add_options, chosen, headline, run_command, stage_parser
@@ -60,10 +60,10 @@ def _make(work: Path, material: Material, mapping: MappingOptions, world: WorldO
     else:
         found, points = material.posed
         without = list(material.without_pose)
-        results = {"images": len(found) + len(without), "registered": len(found), "failed": [], "without_pose": without}
+        results = {"images": len(found) + len(without), "registered": len(found), "without_pose": without}
     results["cameras"], results["note"] = _lenses(found), material.note
     move, results["world"] = place(found, world, mapped=material.posed is None)
-    results["reprojection"] = reprojection(found, points)
+    results["reprojection"] = reprojection(points)
     moved = [replace(shot, viewmat=move.viewmat(shot.viewmat)) for shot in found]
     tracks = points.tracks
     results["points"] = {"count": len(tracks), "mean_track": float(tracks.mean()) if len(tracks) else None}
@@ -124,13 +124,13 @@ def _map(
             photos.append(photo)
             cameras[photo.name] = name
     try:
-        folder, features, matches, others = map_photos(photos, cameras, work, options, tick)
+        folder, others = map_photos(photos, cameras, work, options, tick)
     except DataError as error:
         raise DataError(f"{error} {material.note}".strip()) from error
     model = read_colmap(folder)
     found = from_model(model, {photo.name: photo for photo in photos})
-    failed = failures(photos, found, features, matches)
-    results = {"images": len(photos), "registered": len(found), "failed": failed, "other_models": others}
+    without = sorted({photo.name for photo in photos} - {shot.photo.name for shot in found})
+    results = {"images": len(photos), "registered": len(found), "without_pose": without, "other_models": others}
     return found, model.points, results
 
 
@@ -165,19 +165,18 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
     results = manifest["results"]
     error, world = results["reprojection"], results["world"]
     lines = [headline(out, manifest), f"registered     {results['registered']} of {results['images']} images"]
-    for photo in results["failed"]:
-        facts = f"{photo['features']} features, {photo['matches']} matches"
-        lines.append(f"  without pose {photo['name']} ({facts}): {photo['remedy']}")
     if results.get("without_pose"):
         names = ", ".join(results["without_pose"][:_NAMED])
-        lines.append(f"without pose   {len(results['without_pose'])} photos: {names} …")
+        lines.append(
+            f"without pose   {len(results['without_pose'])} photos (blurred, plain, or too far apart): {names}"
+        )
     if results["note"]:
         lines.append(f"note           {results['note']}")
     if results.get("other_models"):
         lines.append(f"  apart        models of {results['other_models']} images; add photos between them")
     if error["mean"] is not None:
         observations = f"{error['observations']} observations"
-        lines.append(f"reprojection   mean {error['mean']:.3f}, median {error['median']:.3f} pixels ({observations})")
+        lines.append(f"reprojection   mean {error['mean']:.3f} pixels ({observations})")
         lines.append(f"points         {results['points']['count']}, seen by {results['points']['mean_track']:.2f} each")
     lines.append(f"world          up {world['up']}, {world['unit']}")
     for name, facts in results["sequences"].items():

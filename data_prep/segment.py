@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.capture.films.film import probe
-from data_prep.capture.masks.backends import BACKENDS, GROUPS, make_backend
+from data_prep.capture.masks.backends import BACKENDS, ScreenOptions, make_backend
 from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup, cleaned, matte, overlap, steady
 from data_prep.capture.masks.clips import Clip, film_frames, find_clips, is_film
 from data_prep.capture.masks.overlays import write_overlays
@@ -200,11 +200,10 @@ def main(argv: list[str] | None = None) -> int:
     add("--kind", choices=("auto", "film", "stills"), default="auto",
         help="film: a camera that stands still; auto: films, and folders in sequences/ (%(default)s)")  # fmt: skip
     add_options(parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)"), Cleanup, unset=True)
-    for title, kind in GROUPS.items():
-        add_options(parser.add_argument_group(title), kind)
+    add_options(parser.add_argument_group("backends masks, background and chroma"), ScreenOptions)
 
     def run(arguments: argparse.Namespace, tick: Tick) -> str:
-        backend = make_backend(arguments.backend, *(chosen(kind, arguments) for kind in GROUPS.values()))
+        backend = make_backend(arguments.backend, chosen(ScreenOptions, arguments))
         cleanup = replace(UNTOUCHED if arguments.backend == "alpha" else Cleanup(), **given(Cleanup, arguments))
         manifest = segment(
             arguments.pictures, arguments.out, backend, cleanup,

@@ -45,15 +45,9 @@ _GREY, _TINT, _PALE = 0.75, 0.6, 0.7
 
 
 def select(
-    scene: Path,
-    out: Path,
-    selections: Mapping[str, str],
-    *,
-    masks: Path | None = None,
-    up: str = "z",
-    size: int = 360,
-    overwrite: bool = False,
-) -> dict[str, Any]:
+    scene: Path, out: Path, selections: Mapping[str, str], *, masks: Path | None = None, up: str = "z",
+    size: int = 360, overwrite: bool = False,
+) -> dict[str, Any]:  # fmt: skip
     """Runs the stage.
 
     Raises:
@@ -144,14 +138,9 @@ def main(argv: list[str] | None = None) -> int:
     def run(given: argparse.Namespace, tick: Tick) -> str:
         selections = {name: getattr(given, name) for name in MASKS if getattr(given, name)}
         manifest = select(
-            given.scene,
-            given.out,
-            selections,
-            masks=given.masks,
-            up=given.up,
-            size=given.size,
+            given.scene, given.out, selections, masks=given.masks, up=given.up, size=given.size,
             overwrite=given.overwrite,
-        )
+        )  # fmt: skip
         results = manifest["results"]
         lines = [f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels" for name in MASKS]
         return "\n".join([headline(given.out, manifest), *lines, f"look at     {given.out / 'masks.png'}"])

@@ -14,16 +14,9 @@ class ElasticBody:
     """A compiled MuJoCo model of one body of one material."""
 
     def __init__(
-        self,
-        body: Body,
-        material: Material,
-        *,
-        fps: float,
-        time_step: float = 1e-3,
-        viscosity: float | None = None,
-        floor: Floor | None = None,
-        driven: bool = False,
-    ) -> None:
+        self, body: Body, material: Material, *, fps: float, time_step: float = 1e-3, viscosity: float | None = None,
+        floor: Floor | None = None, driven: bool = False,
+    ) -> None:  # fmt: skip
         """Compiles the model.
 
         Args:

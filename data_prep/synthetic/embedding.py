@@ -106,12 +106,9 @@ def embedded_scene(points: Embedding, frames: Array, spacing: float, colors: Arr
     return GaussianScene.create(
         means=torch.from_numpy(points.positions(points.body.nodes)).float(),
         log_scales=torch.from_numpy(np.tile(np.log(scales), (count, 1))).float(),
-        quats=torch.from_numpy(quats).float(),
-        opacity_logits=torch.full((count,), OPACITY_LOGIT),
-        sh=torch.from_numpy(sh).float(),
-        pinned=torch.from_numpy(points.held()),
-        name=name,
-    )
+        quats=torch.from_numpy(quats).float(), opacity_logits=torch.full((count,), OPACITY_LOGIT),
+        sh=torch.from_numpy(sh).float(), pinned=torch.from_numpy(points.held()), name=name,
+    )  # fmt: skip
 
 
 def _outer_faces(body: Body) -> tuple[Ints, Ints, Array]:

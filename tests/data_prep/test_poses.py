@@ -85,8 +85,8 @@ def mapped(photos: Path) -> Path:
 
 def test_photos_become_poses(photos: Path, mapped: Path) -> None:
     results = read_manifest(mapped, "poses")["results"]
-    assert results["registered"] == results["images"] == len(AZIMUTHS) and results["failed"] == []
-    assert results["reprojection"]["mean"] < 0.5 and len(results["reprojection"]["per_image"]) == len(AZIMUTHS)
+    assert results["registered"] == results["images"] == len(AZIMUTHS) and results["without_pose"] == []
+    assert results["reprojection"]["mean"] < 0.5
     assert results["points"]["count"] > 100 and results["points"]["mean_track"] > 2
     posed = read_transforms(mapped / "transforms.json")
     assert [f.path.name for f in posed.frames] == [f"photo {i}.png" for i in range(len(AZIMUTHS))]
@@ -111,8 +111,6 @@ def test_a_found_model_is_taken_over_for_smaller_photos(photos: Path, mapped: Pa
     results = find_poses(tmp_path / "out", sources, mapping=OPTIONS)["results"]
     whole, half = read_transforms(mapped / "transforms.json"), read_transforms(tmp_path / "out" / "transforms.json")
     np.testing.assert_allclose(half.cameras.Ks[0, :2], whole.cameras.Ks[0, :2] / 2, rtol=1e-6)
-    error = read_manifest(mapped)["results"]["reprojection"]["mean"]
-    assert results["reprojection"]["mean"] == pytest.approx(error / 2, rel=0.02)
     # Taken over, the world stays as COLMAP left it; it is the same but for a similarity.
     assert results["world"]["up"] == "as given"
     assert apart(half.cameras.viewmats.double().numpy(), whole.cameras.viewmats.double().numpy()) < 1e-5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,11 @@ import pytest
 
 from data_prep.capture.masks.cleanup import Cleanup, overlap
 from data_prep.capture.masks.clips import find_clips
-from data_prep.capture.masks.network import NetworkOptions, OnnxSegmenter
 from data_prep.capture.masks.segmenters import Backend
 from data_prep.common.photos import read_picture
 from data_prep.common.stage import read_manifest
 from data_prep.segment import main, segment
-from gausim.core import ConfigError, DataError
+from gausim.core import DataError
 from gausim.io.video import read_video, write_video
 
 SIZE = 96, 72
@@ -133,84 +131,6 @@ def test_a_film_can_be_segmented_directly(tmp_path: Path) -> None:
     assert main([str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "out"), "--backend", "chroma"]) == 0
     masks = [read_picture(p)[..., 3] for p in sorted((tmp_path / "out" / "clip").glob("*.png"))]
     assert len(masks) == FRAMES and agreement(masks) > 0.85
-
-
-# ---- ONNX
-
-
-def proto(field: int, value: bytes | int) -> bytes:
-    """A field of a protocol buffer: a varint, or bytes with their length."""
-
-    def varint(n: int) -> bytes:
-        return bytes([n]) if n < 128 else bytes([n & 127 | 128]) + varint(n >> 7)
-
-    if isinstance(value, int):
-        return varint(field << 3) + varint(value)
-    return varint(field << 3 | 2) + varint(len(value)) + value
-
-
-def tensor_type(name: str, shape: tuple[int | str, ...]) -> bytes:
-    dims = b"".join(proto(1, proto(1, n) if isinstance(n, int) else proto(2, n.encode())) for n in shape)
-    return proto(1, name.encode()) + proto(2, proto(1, proto(1, 1) + proto(2, dims)))
-
-
-def network(path: Path, operation: str, *, side: int | str = 32, channels: int = 3) -> Path:
-    """A network of one ReduceMax (over channels) or other operation, written by hand: no ONNX library is needed."""
-    node = proto(1, b"x") + proto(2, b"y") + proto(4, operation.encode())
-    if "Reduce" in operation:
-        node += proto(5, proto(1, b"axes") + proto(8, 1) + proto(20, 7))
-    given = proto(11, tensor_type("x", (1, channels, side, side)))
-    made = proto(12, proto(1, b"y") + proto(2, proto(1, proto(1, 1))))
-    graph = proto(1, node) + proto(2, b"g") + given + made
-    path.write_bytes(proto(1, 8) + proto(7, graph) + proto(8, proto(1, b"") + proto(2, 12)))
-    return path
-
-
-def network_of(path: Path, **options: Any) -> OnnxSegmenter:
-    return OnnxSegmenter(NetworkOptions(onnx=path, **{f"onnx_{name}": value for name, value in options.items()}))
-
-
-def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
-    """Size, mean, scale and activation are options; the mask comes back at the picture's size."""
-    pytest.importorskip("onnxruntime")
-    rgb = np.where(disc(3)[..., None], np.uint8(250), np.uint8(5)).repeat(3, axis=-1)
-    write(tmp_path / "in" / "a.png", rgb)
-    file = network(tmp_path / "max.onnx", "ReduceMax", side="n")
-    options = ["--onnx", str(file), "--onnx-size", "96", "--onnx-mean", "5", "--onnx-scale", "245", "--backend", "onnx"]
-    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), *options]) == 0
-    mask = read_picture(tmp_path / "out" / "a.png")[..., 3]
-    assert mask.shape == SIZE[::-1] and overlap(mask, disc(3).astype(np.uint8) * 255) > 0.95
-    sigmoid = network_of(file, size=32, mean=(127.0,) * 3, scale=(10.0,) * 3, activation="sigmoid").mask(rgb)
-    assert sigmoid[disc(3)].max() == pytest.approx(1, abs=1e-4) and sigmoid[0, -1] == pytest.approx(0, abs=1e-4)
-    stretched = network_of(file, size=48, mean=(7.0,), scale=(3.0,), activation="minmax").mask(rgb)
-    assert stretched.min() == 0 and stretched.max() == 1
-
-
-@pytest.mark.parametrize(
-    ("made", "options", "what"),
-    [
-        ({}, {"mean": (0.0,), "scale": (1.0,)}, "values of .* expected 0 to 1. Try --onnx-activation"),
-        ({}, {"size": 64}, "--onnx-size is 64"),
-        ({}, {"output": 2}, "has outputs 0 to 0, asked for 2"),
-        ({"side": "n"}, {}, "--onnx-size is None"),
-        ({"channels": 1}, {}, "expected one input of float32"),
-        ({"operation": "Identity"}, {}, "no map of finite"),
-        ({"operation": "Log"}, {"mean": (255.0,)}, "no map of finite"),
-    ],
-)
-def test_networks_that_do_not_fit_are_named(tmp_path: Path, made: dict, options: dict, what: str) -> None:
-    pytest.importorskip("onnxruntime")
-    with pytest.raises((ConfigError, DataError), match=what):
-        network_of(network(tmp_path / "a.onnx", **{"operation": "ReduceMax", **made}), **options).mask(picture(1))
-
-
-def test_files_that_are_no_networks_are_named(tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
-    (tmp_path / "noise.onnx").write_bytes(struct.pack("40d", *range(40)))
-    with pytest.raises(DataError, match=r"noise.onnx: cannot be loaded"):
-        network_of(tmp_path / "noise.onnx")
-    with pytest.raises(DataError, match="no such network"):
-        network_of(tmp_path / "none.onnx")
 
 
 def test_masks_of_another_program_are_taken(film: Path, tmp_path: Path, capsys: Any) -> None:

@@ -73,9 +73,3 @@ def straighten(camera: ColmapCamera, where: Path) -> Straightened:
         raise DataError(f"{what}: its lens folds over. Calibrate it again, with a simpler model.")
     maps = tuple(np.ascontiguousarray(seen[..., i], np.float32) for i in (0, 1))
     return Straightened(k, (maps[0], maps[1]))
-
-
-def project(camera: ColmapCamera, viewmat: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, 2) pixels at which the lens sees world points (n, 3); NaN behind it."""
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    return np.asarray(lens(camera).img_from_cam(np.ascontiguousarray(local))).reshape(-1, 2)

@@ -70,33 +70,33 @@ class MappingOptions(Options):
 
 def map_photos(
     photos: Sequence[Photo], cameras: Mapping[str, str], work: Path, options: MappingOptions, tick: Tick
-) -> tuple[Path, dict[str, int], dict[str, int], list[int]]:
+) -> tuple[Path, list[int]]:
     """Finds the poses of photos.
 
     Returns:
-        Folder of the COLMAP model with most images, in the photos' names; per photo the number of its features, and
-        the inliers of all its verified pairs; numbers of images of the models that could not be joined with that one.
+        Folder of the COLMAP model with most images, in the photos' names; numbers of images of the models that could
+        not be joined with that one.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     if len(photos) < _SMALLEST_MODEL:
         raise DataError(f"{len(photos)} photos: expected at least {_SMALLEST_MODEL}; the paper takes 200.")
-    features = {p.name: _extract(p, work, options, tick, i, len(photos)) for i, p in enumerate(photos)}
+    for i, photo in enumerate(photos):
+        _extract(photo, work, options, tick, i, len(photos))
     database = work / SCRATCH / "database.db"
     if not database.is_file():
         _fill(database, photos, cameras, work, options)
     _match(database, photos, work, options, tick)
-    matches = _inliers(database, photos)
     folder = work / "colmap" / "sparse" / "0"
     sizes = _mapped(database, photos, folder, options, tick)
-    return folder, features, matches, sizes[1:]
+    return folder, sizes[1:]
 
 
 def _features_file(work: Path, number: int) -> Path:
     return work / SCRATCH / f"{number:06d}.npz"
 
 
-def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, number: int, total: int) -> int:
-    """Writes the features of one photo and returns their number."""
+def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, number: int, total: int) -> None:
+    """Writes the features of one photo, unless they are there."""
     path = _features_file(work, number)
     if not path.is_file():
         gray = reduced(cv2.cvtColor(photo.read(), cv2.COLOR_RGBA2GRAY), options.feature_size)
@@ -112,7 +112,6 @@ def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, numb
         keypoints[:, :2] *= np.array([photo.width / gray.shape[1], photo.height / gray.shape[0]], np.float32)
         write_npz(path, keypoints=keypoints, descriptors=np.array(descriptors.data, np.uint8))
     tick("features", number + 1, total)
-    return len(read_npz(path, ["keypoints"])["keypoints"])
 
 
 def _fill(path: Path, photos: Sequence[Photo], cameras: Mapping[str, str], work: Path, options: MappingOptions) -> None:
@@ -173,16 +172,6 @@ def _match(database: Path, photos: Sequence[Photo], work: Path, options: Mapping
         pycolmap.set_random_seed(SEED)
         pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
         tick("pairs", len(pairs) - len(left) + start + len(part), len(pairs))
-
-
-def _inliers(database: Path, photos: Sequence[Photo]) -> dict[str, int]:
-    sums = {photo.name: 0 for photo in photos}
-    with pycolmap.Database.open(database) as file:
-        names = {image.image_id: photos[int(image.name)].name for image in file.read_all_images()}
-        for pair, count in zip(*file.read_two_view_geometry_num_inliers(), strict=True):
-            for image in pycolmap.pair_id_to_image_pair(pair):
-                sums[names[image]] += count
-    return sums
 
 
 def _mapped(database: Path, photos: Sequence[Photo], folder: Path, options: MappingOptions, tick: Tick) -> list[int]:

@@ -1,4 +1,4 @@
-"""Quality of poses: reprojection errors, tracks, reasons of failed photos, a picture of cameras and points."""
+"""Quality of poses: reprojection errors, colours of points, a picture of cameras and points."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.capture.cameras.lenses import project
 from data_prep.capture.cameras.sources import Posed
 from data_prep.capture.cameras.world import centers
-from data_prep.common.photos import Photo
 from gausim.io.colmap import PointTable
-
-# Fewer features than this are a photo without texture, fewer inliers one that no other photo shares a view with.
-_FEW_FEATURES, _FEW_MATCHES = 300, 60
 
 
 def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
@@ -28,44 +23,10 @@ def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarr
     return known, rows[known]
 
 
-def reprojection(posed: Sequence[Posed], points: PointTable) -> dict[str, Any]:
-    """Distances between where photos show points and where their cameras see them [pixels], over all observations."""
-    per_image: dict[str, float | None] = {}
-    every = []
-    for shot in posed:
-        known, rows = _observations(shot, points)
-        if not known.any():
-            continue
-        error = np.linalg.norm(project(shot.camera, shot.viewmat, points.xyz[rows]) - shot.xy[known], axis=1)
-        # Behind the camera there is no pixel; that is worse than any error that could be written.
-        error = error[np.isfinite(error)]
-        every.append(error)
-        per_image[shot.photo.name] = float(error.mean()) if len(error) else None
-    if not every:
-        return {"observations": 0, "mean": None, "median": None, "per_image": {}}
-    errors = np.concatenate(every)
-    means = {"mean": float(errors.mean()), "median": float(np.median(errors))}
-    return {"observations": len(errors), **means, "per_image": per_image}
-
-
-def failures(
-    photos: Sequence[Photo], posed: Sequence[Posed], features: dict[str, int], matches: dict[str, int]
-) -> list[dict[str, Any]]:
-    """The photos that got no pose, with their features and inlier matches, and what usually helps."""
-    good = {shot.photo.name for shot in posed}
-    failed = []
-    for photo in photos:
-        if photo.name in good:
-            continue
-        count, inliers = features[photo.name], matches[photo.name]
-        if count < _FEW_FEATURES:
-            remedy = "few features: blurred, dark, without texture; take it again, or put printed cloth into the scene"
-        elif inliers < _FEW_MATCHES:
-            remedy = "no other photo shows enough of the same: photos in between, --thorough, or --matching exhaustive"
-        else:
-            remedy = "matches fit no camera: the scene moved, mirrors or repeats itself, or the lens model is wrong"
-        failed.append({"name": photo.name, "features": count, "matches": inliers, "remedy": remedy})
-    return failed
+def reprojection(points: PointTable) -> dict[str, Any]:
+    """Mean distance between where photos show points and where their cameras see them, as COLMAP states it [pixels]."""
+    count = int(points.tracks.sum())
+    return {"observations": count, "mean": float((points.error * points.tracks).sum() / count) if count else None}
 
 
 def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:

@@ -25,7 +25,7 @@ from gausim.io.colmap import (
     find_colmap,
     no_points,
     read_colmap,
-)
+)  # fmt: skip
 from gausim.io.files import natural
 from gausim.io.plain_json import read_json
 

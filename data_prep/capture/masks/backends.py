@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from data_prep.capture.masks.clips import Clip
-from data_prep.capture.masks.network import NetworkOptions, OnnxSegmenter
 from data_prep.capture.masks.segmenters import Backend, BackgroundSegmenter, ChromaSegmenter, MaskOf, alpha_masks
 from data_prep.common.command import Options, option
 from data_prep.common.photos import find_mask, read_mask
 from gausim.core import ConfigError
 
-BACKENDS = ("alpha", "masks", "background", "chroma", "onnx")
+BACKENDS = ("alpha", "masks", "background", "chroma")
 
 
 def colour(text: str) -> tuple[int, int, int]:
@@ -42,10 +40,7 @@ class ScreenOptions(Options):
     no_grabcut: bool = option(False, "leave the masks as the difference gives them")
 
 
-GROUPS = {"backends masks, background and chroma": ScreenOptions, "backend onnx": NetworkOptions}
-
-
-def make_backend(name: str, screen: ScreenOptions, network: NetworkOptions) -> Backend:
+def make_backend(name: str, screen: ScreenOptions) -> Backend:
     """The backend of a name."""
     refine = not screen.no_grabcut
     if name == "masks":
@@ -61,13 +56,6 @@ def make_backend(name: str, screen: ScreenOptions, network: NetworkOptions) -> B
     if name == "chroma":
         settings = {"key": screen.key, "grabcut": refine}
         return Backend(name, ChromaSegmenter(screen.key, refine).open, settings=settings)
-    if name == "onnx":
-        if network.onnx is None:
-            raise ConfigError("--backend onnx: name the network with --onnx FILE.")
-        loaded = cache(OnnxSegmenter)  # once, and only if there is something to do
-        settings = {key: value for key, value in asdict(network).items() if key != "onnx"}
-        files = {"network": network.onnx}
-        return Backend(name, lambda clip: loaded(network).open(clip), True, settings, files, ("onnxruntime",))
     return Backend(name, alpha_masks, soft=True)
 
 

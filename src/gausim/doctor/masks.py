@@ -63,7 +63,7 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
     rims = [_rim(p).astype(np.float32) for i in evidence.first for p in i.rgb[0, index]]
     spread = float(np.median([rim.std(0).max() for rim in rims]))
     hue = float(np.median([np.ptp(rim.mean(0)) for rim in rims]))
-    backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend masks"
+    backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background or --backend masks"
     return Finding(
         "fault", "certain",
         f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background would be taken "
