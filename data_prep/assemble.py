@@ -66,12 +66,7 @@ def assemble(
     pictures: Sequence[Path], out: Path, options: AssembleOptions | None = None, *, scene: Path | None = None,
     overwrite: bool = False, tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the stage.
-
-    Raises:
-        DataError: there are no sequences, they do not go together, or the result would have faults.
-        ConfigError: an option does not suit the pictures.
-    """
+    """Runs the stage."""
     from data_prep.ready.gathered import gather
 
     options, found = options or AssembleOptions(), gather(pictures)
@@ -135,11 +130,9 @@ def _make(
     refuse_faults(work, out)
     return {
         "stills": len(found.stills.frames) if found.stills is not None else 0,
-        "sequences": {name: _length(posed.frames) for name, posed in found.sequences.items()},
-        "facts": facts,
-        "scene": SCENE in files,
-        "files": files_in(work),
-    }
+        "sequences": {name: _length(posed.frames) for name, posed in found.sequences.items()}, "facts": facts,
+        "scene": SCENE in files, "files": files_in(work),
+    }  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -56,12 +56,9 @@ def main(argv: list[str] | None = None) -> int:
         add_options(group, kind, unset=True)
     add = parser.add_argument_group("Blender").add_argument
     add(
-        "--blender-python",
-        type=Path,
-        default=default_python(),
-        metavar="PATH",
+        "--blender-python", type=Path, default=default_python(), metavar="PATH",
         help="a Python that has bpy (%(default)s)",
-    )
+    )  # fmt: skip
     add("--workers", type=int, default=cores(), help="processes at a time (%(default)s)")
     return run_command(parser, argv, _run)
 

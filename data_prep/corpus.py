@@ -32,11 +32,7 @@ SHARD, PIECES = 32, "pieces"  # bodies of a shard; folder of those that are in n
 
 
 def make_corpus(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
-    """Makes a corpus.
-
-    Raises:
-        DataError: ``out`` holds something else, or a mesh is unusable.
-    """
+    """Makes a corpus."""
     settings = {**asdict(plan), "meshes": [path.name for path in plan.meshes]}
     if len(set(settings["meshes"])) < len(plan.meshes):
         raise ConfigError(f"--meshes: two files have one name: {', '.join(settings['meshes'])}.")

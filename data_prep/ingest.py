@@ -76,11 +76,7 @@ class IngestOptions(Options):
 def ingest(
     films: Path, out: Path, options: IngestOptions | None = None, *, overwrite: bool = False, tick: Tick = silent
 ) -> dict[str, Any]:
-    """Writes synchronised frames of all sequences.
-
-    Raises:
-        DataError: a film is unusable, or the films do not go together.
-    """
+    """Writes synchronised frames of all sequences."""
     options = options or IngestOptions()
     takes = find_takes(films)
     told = [{**asdict(take), "films": {camera: path.name for camera, path in take.films.items()}} for take in takes]
@@ -122,9 +118,6 @@ def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Al
 
     Returns:
         The films and their alignment by camera, and what the manifest says of the sequence.
-
-    Raises:
-        DataError: a film is unusable, or the films do not go together.
     """
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:

@@ -25,11 +25,7 @@ PARTS = ("dataset.json", "scene.ply", "scene.masks.npz", "scene.json", "rest_poi
 
 
 def pack(root: Path, out: Path, *, margin: int = 2, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
-    """Packs one object.
-
-    Raises:
-        DataError: a sequence is incomplete, an image unreadable, or ``out`` holds something else.
-    """
+    """Packs one object."""
     from gausim.data.objects import ObjectData
 
     if margin < 0:

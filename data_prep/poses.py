@@ -38,12 +38,7 @@ def find_poses(
     out: Path, sources: Sources, *, mapping: MappingOptions, world: WorldOptions | None = None, overwrite: bool = False,
     tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the stage.
-
-    Raises:
-        DataError: an input is missing or broken, or no poses can be found.
-        ConfigError: options contradict each other.
-    """
+    """Runs the stage."""
     world = world or WorldOptions()
     material = Material.of(sources)
     settings: dict[str, Any] = {"source": sources.kind, "fps": material.fps, "world": asdict(world)}

@@ -43,11 +43,7 @@ def segment(
     source: Path, out: Path, backend: Backend, cleanup: Cleanup, *, kind: str = "auto", every: int = 1,
     overwrite: bool = False, tick: Tick = silent,
 ) -> dict[str, Any]:  # fmt: skip
-    """Writes the pictures of ``source`` with their masks as alpha.
-
-    Raises:
-        DataError: a picture is unusable, or a folder's masks are all empty.
-    """
+    """Writes the pictures of ``source`` with their masks as alpha."""
     if every < 1:
         raise ConfigError(f"--every: expected at least 1, got {every}.")
     film = is_film(source)

@@ -48,13 +48,7 @@ def select(
     scene: Path, out: Path, selections: Mapping[str, str], *, masks: Path | None = None, up: str = "z",
     size: int = 360, overwrite: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the stage.
-
-    Raises:
-        SceneError: the scene or a selection is malformed, or a selection holds no kernel.
-        DataError: a file of points is malformed.
-        ConfigError: nothing is selected.
-    """
+    """Runs the stage."""
     from data_prep.ready.selections import parse_selection
     from gausim.io.ply import masks_path
 

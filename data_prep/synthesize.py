@@ -29,11 +29,7 @@ PACKAGES = ("mujoco", "numpy", "scipy", "torch", "opencv-python-headless")
 
 
 def synthesize(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
-    """Makes a set.
-
-    Raises:
-        DataError: ``out`` holds something else.
-    """
+    """Makes a set."""
     stage = Stage("synthesize", REVISION, {}, asdict(plan), PACKAGES)
     return run_stage(stage, out, lambda work: _write_all(work, plan, workers, tick), overwrite=overwrite)
 

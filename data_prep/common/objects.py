@@ -16,13 +16,9 @@ def object_facts(
 ) -> dict[str, Any]:
     """The fields of ``dataset.json`` that every object has."""
     return {
-        "name": name,
-        "fps": fps,
-        "views": list(views),
-        "train_views": [view for view in views if view not in heldout],
-        "heldout_views": [view for view in views if view in heldout],
-        "train_frames": [0, train_frames],
-    }
+        "name": name, "fps": fps, "views": list(views), "train_views": [view for view in views if view not in heldout],
+        "heldout_views": [view for view in views if view in heldout], "train_frames": [0, train_frames],
+    }  # fmt: skip
 
 
 def described(facts: Mapping[str, Any], stills: int, sequences: Mapping[str, int]) -> list[str]:

@@ -31,8 +31,6 @@ META, POSES, FINAL, TRACKS, SPLIT = "metadata.json", "calibrate.pkl", "final_dat
 HUMAN, HAND = "different_types_human_mask", "hand"
 # The distance up to which the authors tie an object's points to a controller point at first [m].
 GRIP = 0.04
-# More points than this say no more about where a hand is.
-_MOST_CONTROLLERS = 1000
 
 
 @dataclass(frozen=True)
@@ -152,8 +150,6 @@ def _final(path: Path, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not isinstance(data, dict) or not set(keys) <= set(data):
         raise DataError(f"{path}: expected a dict of arrays with the fields {', '.join(keys)}. {REMEDY}")
     points, body = (numbers(data[key], (count, -1, 3), f"{path}: field '{key}'") for key in keys)
-    if points.shape[1] > _MOST_CONTROLLERS:
-        raise DataError(f"{path}: field 'controller_points' has more than {_MOST_CONTROLLERS} points. {REMEDY}")
     colors: Any = data.get("object_colors", np.full_like(body, 0.5))
     return points, body, numbers(colors, body.shape, f"{path}: field 'object_colors'")
 

@@ -108,12 +108,10 @@ class PublicObject:
         return {**self.files, **{Path(os.path.relpath(path, self.root)).as_posix(): path for path in sorted(found)}}
 
     def checked(self) -> PublicObject:
-        """Itself, or an error where its parts do not go together."""
-        sequences, stills = [motion.name for motion in self.motions], [view.name for view, _ in self.stills]
-        for what, found in (("sequences", sequences), ("stills", stills)):
-            twice = sorted({name for name in found if found.count(name) > 1})
-            if twice:
-                raise DataError(f"{self.root}: two {what} would get the name '{twice[0]}'. Rename one of their files.")
+        """Itself, or an error where parts do not go together: names, numbers of frames, held-out cameras."""
+        stills = [view.name for view, _ in self.stills]
+        if len(set(stills)) < len(stills):
+            raise DataError(f"{self.root}: two stills would get one name, of {sorted(stills)[:20]}. Rename a file.")
         for motion in self.motions:
             counts = {name: len(row) for name, row in motion.pictures.items()}
             if len(set(counts.values())) > 1:

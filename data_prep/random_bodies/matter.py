@@ -69,13 +69,11 @@ def random_matter(body: Body, rng: Rng, *, kinds: Sequence[str], even_drag: bool
         density = drag = 0.0
     young = contrast**level
     return Matter(
-        kind=kind,
-        contrast=float(young.max() / young.min()),
-        poisson_ratio=float(rng.uniform(*POISSON_RATIOS)),
+        kind=kind, contrast=float(young.max() / young.min()), poisson_ratio=float(rng.uniform(*POISSON_RATIOS)),
         young_modulus=young / np.exp(np.log(young).mean()),
         density=np.exp(density * (level - level.mean())) * np.exp(rng.uniform(*np.log(DENSITIES))),
         drag=np.exp(drag * (level - level.mean())),
-    )
+    )  # fmt: skip
 
 
 def random_drag(omega: float, rng: Rng) -> float:

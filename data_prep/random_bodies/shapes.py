@@ -142,11 +142,7 @@ def figure(rng: Rng) -> Field:
 
 @cache
 def from_mesh(path: Path) -> Field:
-    """The inside of a surface: its winding number, by dipoles spread over it (Barill et al. 2018), above a half.
-
-    Raises:
-        DataError: the file is unusable.
-    """
+    """The inside of a surface: its winding number, by dipoles spread over it (Barill et al. 2018), above a half."""
     mesh = read_mesh(path)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     corners = (((mesh.vertices - (low + high) / 2) / (0.5 * (high - low).max())) * 0.95)[mesh.triangles]

@@ -48,10 +48,6 @@ def write_scene(work: Path, root: Path, near: float, *, anchor: float | None = N
         near: distance to a cloud within which kernels belong to it [scene units].
         anchor: kernels of the object this near to the moving ones, but not moving, are simulated and pinned
             [scene units]; None: the pins are those of the list.
-
-    Raises:
-        SceneError: the point cloud is no 3DGS scene, or a mask marks nothing.
-        DataError: a cloud or the list is malformed.
     """
     import torch
 

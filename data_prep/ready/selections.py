@@ -19,14 +19,9 @@ from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selectio
 
 # Syntax of a term, by its first word.
 FORMS = {
-    "all": "all",
-    "below": "below AXIS=VALUE",
-    "above": "above AXIS=VALUE",
-    "box": "box X,Y,Z X,Y,Z",
-    "near": "near FILE DISTANCE",
-    "component": "component RADIUS [X,Y,Z]",
-    "mask": "mask simulated|pinned|foreground",
-}
+    "all": "all", "below": "below AXIS=VALUE", "above": "above AXIS=VALUE", "box": "box X,Y,Z X,Y,Z",
+    "near": "near FILE DISTANCE", "component": "component RADIUS [X,Y,Z]", "mask": "mask simulated|pinned|foreground",
+}  # fmt: skip
 GRAMMAR = "TERM [and|or] [not] TERM ..., a TERM being " + "; ".join(FORMS.values())
 # Point sets above this would take hours against a scene.
 _MOST_POINTS = 5_000_000
@@ -49,10 +44,6 @@ def parse_selection(text: str) -> tuple[Selection, list[Path]]:
 
     Returns:
         The selection and the files that it reads.
-
-    Raises:
-        SceneError: the text is of another form, or a number in it is not finite.
-        DataError: a file of points is missing or malformed.
     """
     try:
         words = shlex.split(text)

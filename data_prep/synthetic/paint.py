@@ -60,8 +60,6 @@ def _bar(x: Array, grid: Ints) -> Array:
 
 # Of each body its colours, and how many dabs of random colours it has, of which radius [scene units].
 PAINTERS: dict[str, tuple[Callable[[Array, Ints], Array], int, float]] = {
-    "pudding": (_pudding, 26, 0.075),
-    "flower": (_flower, 22, 0.06),
-    "jelly": (_jelly, 60, 0.1),
+    "pudding": (_pudding, 26, 0.075), "flower": (_flower, 22, 0.06), "jelly": (_jelly, 60, 0.1),
     "bar": (_bar, 40, 0.055),
-}
+}  # fmt: skip

@@ -122,22 +122,14 @@ class SyntheticObject:
         plan, recipe = self.plan, self.recipe
         gravity = 0.0 if recipe.floor is None else recipe.floor.gravity
         facts: dict[str, object] = {
-            "name": self.name,
-            "fps": plan.fps,
-            "frames": plan.frames,
-            "sequences": plan.sequences,
-            "views": list(plan.views),
-            "train_views": list(plan.views[:-1]),
-            "heldout_views": [plan.views[-1]],
+            "name": self.name, "fps": plan.fps, "frames": plan.frames, "sequences": plan.sequences,
+            "views": list(plan.views), "train_views": list(plan.views[:-1]), "heldout_views": [plan.views[-1]],
             "train_frames": [0, TRAIN_FRAMES if recipe.train is None else round(recipe.train * plan.frames)],
-            "resolution": plan.resolution,
-            "static_views": plan.stills,
-            "static_resolution": plan.still_resolution,
+            "resolution": plan.resolution, "static_views": plan.stills, "static_resolution": plan.still_resolution,
             "object_diagonal": self.scene.diagonal,
-            "alpha": "straight; foreground mask = alpha; composite as rgb * alpha",
-            "seed": plan.seed,
+            "alpha": "straight; foreground mask = alpha; composite as rgb * alpha", "seed": plan.seed,
             "simulation": {"method": "MuJoCo flex, linear tetrahedra", "gravity": gravity, **recipe.facts},
-        }
+        }  # fmt: skip
         if recipe.floor is not None:
             floor = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": recipe.floor.friction}
             facts |= {"free": True, "gravity": [0.0, 0.0, -gravity], "floor": floor}

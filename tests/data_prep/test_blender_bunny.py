@@ -25,7 +25,7 @@ from data_prep.blender import environment as blender_env
 from data_prep.blender import plan as planning
 from data_prep.blender.environment import BlenderError, BlenderProcess, find_blender
 from data_prep.blender.meshes import Surface, make_surface, read_mesh
-from data_prep.blender.plan import Pictures, Plan, Soft, action, cage, camera
+from data_prep.blender.plan import Pictures, Plan, Soft, action, camera
 from data_prep.blender_bunny import main, make_set
 from gausim.core import ConfigError
 from gausim.data.objects import ObjectData
@@ -174,14 +174,6 @@ def test_cameras_see_the_whole_object(surface: Surface) -> None:
     np.testing.assert_allclose(angles, [20, 200, 110])
     for size in ((540, 960), (960, 540)):
         assert camera(size)["focal"] == pytest.approx(270 / np.tan(np.radians(20)))
-
-
-def test_cage_encloses_the_object_with_even_cells(surface: Surface) -> None:
-    spec = cage(surface)
-    assert spec["points"] == [4, 5, 7] and spec["pinned_layers"] == 2
-    half = np.array(spec["spacing"]) * (np.array(spec["points"]) - 1) / 2
-    assert (np.abs(surface.vertices - spec["center"]) < half).all()
-    assert max(spec["spacing"]) < 1.6 * min(spec["spacing"])
 
 
 # -------------------------------------------------------------------------------------------------------- environment

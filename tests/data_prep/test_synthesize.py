@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.plain import contents
-from scipy.optimize import brentq
 
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed (extra 'synth')", allow_module_level=True)
@@ -15,11 +14,10 @@ if importlib.util.find_spec("mujoco") is None:
 from data_prep.synthesize import main
 from data_prep.synthetic.bodies import BODIES, Body
 from data_prep.synthetic.elastic import ElasticBody
-from data_prep.synthetic.embedding import _outer_faces, cover_surface
-from data_prep.synthetic.plan import RECIPES, SMALL_SWING, Material, Plan
-from data_prep.synthetic.pushes import DRAWS, Push, push_field, pushed_motion, random_motion, random_push
+from data_prep.synthetic.embedding import cover_surface
+from data_prep.synthetic.plan import RECIPES, SMALL_SWING, Material
+from data_prep.synthetic.pushes import push_field, pushed_motion, random_push
 from data_prep.synthetic.rig import still_cameras, video_cameras
-from data_prep.synthetic.writer import SyntheticObject
 from gausim.core import DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import composite
@@ -127,15 +125,6 @@ def test_objects_stay_in_every_image_while_they_swing(name: str) -> None:
         assert (pixel.amax(1) - pixel.amin(1)).amax(-1).min() > 48, "the object is small in the image"
 
 
-def test_tetrahedra_fill_the_body_without_gaps(body: Body) -> None:
-    """Every inner triangle is shared by exactly two tetrahedra: Kuhn's split fits across cells."""
-    tets = body.tetrahedra
-    triangles = np.sort(np.concatenate([tets[:, np.delete(np.arange(4), i)] for i in range(4)]), axis=1)
-    _, counts = np.unique(triangles, axis=0, return_counts=True)
-    assert set(counts.tolist()) == {1, 2}
-    assert (counts == 1).sum() == 2 * len(_outer_faces(body)[0])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(n for n, recipe in RECIPES.items() if recipe.body in PUSHED))
 def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
@@ -157,46 +146,6 @@ def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
     assert 0.4 < left < 0.7 if recipe.viscosity is None else 0.2 < left < 0.35
 
 
-@pytest.mark.parametrize("steep", [0.5, 1.0, 2.1, 2.5])
-def test_large_swings_are_reached_however_steeply_a_body_answers(steep: float) -> None:
-    body = BODIES[PUSHED[0]]()
-
-    class Answer:
-        def simulate(self, velocity: np.ndarray, frames: int) -> np.ndarray:
-            size = np.linalg.norm(velocity, axis=1).max() / body.diagonal
-            return np.stack([body.nodes, body.nodes + velocity * 0.4 * size ** (steep - 1)])
-
-    push = random_push(body, "poke", np.random.default_rng(3), (0.27, 0.28))
-    moved = pushed_motion(body, Answer(), push, 50) - body.nodes
-    assert np.linalg.norm(moved, axis=-1).max() / body.diagonal == pytest.approx(push.amplitude, rel=0.05)
-
-
-@pytest.mark.parametrize("wrong", [3, DRAWS])
-def test_pushes_that_turn_a_body_inside_out_are_drawn_again(wrong: int) -> None:
-    body, seen = BODIES["pudding"](), []
-
-    class Answer:
-        """Reaches every amplitude at once; upside down at first."""
-
-        def simulate(self, velocity: np.ndarray, frames: int) -> np.ndarray:
-            moved = body.nodes + velocity * 0.065 * body.diagonal / np.linalg.norm(velocity, axis=1).max()
-            if frames == 50:
-                seen.append(velocity)
-            return np.stack([body.nodes, moved * (-1.0 if frames == 50 and len(seen) <= wrong else 1.0)])
-
-    def drawn() -> tuple[Push, np.ndarray]:
-        return random_motion(body, Answer(), "drag", np.random.default_rng(3), SMALL_SWING, 50)
-
-    if wrong == DRAWS:
-        with pytest.raises(DivergenceError, match=r"50 pushes of 0.05 to 0.08 diagonals all .* a smaller --swing"):
-            drawn()
-        return
-    push, motion = drawn()
-    rng = np.random.default_rng(3)
-    assert push == [random_push(body, "drag", rng, SMALL_SWING) for _ in range(wrong + 1)][-1]
-    assert len(seen) == wrong + 1 and body.least_volume(motion) > 0
-
-
 def test_the_least_volume_is_that_of_the_smallest_element() -> None:
     body = BODIES["flower"]()
     assert body.least_volume(0.5 * body.nodes[None]) == pytest.approx(0.125)
@@ -205,29 +154,6 @@ def test_the_least_volume_is_that_of_the_smallest_element() -> None:
     corner = body.tetrahedra[-1]
     moved[1, corner[0]] += 1.5 * (body.nodes[corner[1:]].mean(0) - body.nodes[corner[0]])
     assert body.least_volume(moved) < -0.4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(n for n, recipe in RECIPES.items() if recipe.body in PUSHED))
-def test_objects_move_on_nearly_alike_after_a_push_of_one_per_cent_more(name: str) -> None:
-    """No element is inside out, and the motion of frames 16..49 is not left to chance."""
-    made = SyntheticObject(name, Plan(objects=(name,)))
-    body, elastic = made.body, made.elastic
-
-    def moved(speed: float, field: np.ndarray, frames: int = 2) -> np.ndarray:
-        return elastic.simulate(speed * field, frames) - body.nodes
-
-    def beyond(speed: float, field: np.ndarray, motion: np.ndarray) -> float:
-        return float(np.linalg.norm(moved(speed, field)[1]) - np.linalg.norm(motion[1]))
-
-    for number in range(8):
-        motion, cause = made._motion(number)
-        assert body.least_volume(motion) > 0
-        field, motion = push_field(body, Push(**cause)), motion - body.nodes
-        speed = brentq(beyond, 0.1, 20, args=(field, motion))
-        np.testing.assert_allclose(moved(speed, field)[1], motion[1], atol=1e-6)
-        later = (moved(1.01 * speed, field, 50) - motion)[16:]
-        assert np.linalg.norm(later) < 0.1 * np.linalg.norm(motion[16:])
 
 
 @pytest.mark.parametrize("name", PUSHED)
