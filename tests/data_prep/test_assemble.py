@@ -60,7 +60,7 @@ def test_an_object_is_complete_and_right(toy: Any, tmp_path: Path, capsys: pytes
     out = tmp_path / "flower"
     assert main([str(toy.root), "--out", str(out), "--scene", str(tmp_path / "scene"), "--train-frames", "5"]) == 0
     text = capsys.readouterr().out
-    assert "train cam_0, cam_1; never trained on: cam_2" in text and f"data.root={out}" in text
+    assert "train cam_0, cam_1; never trained on: cam_2" in text and f"data={out}" in text
     assert verify(out) == []
     data = ObjectData(out)
     assert data.name == "flower" and data.fps == 24 and data.train_frames == range(5)

@@ -24,6 +24,7 @@ from gausim.data.images import composite
 from gausim.ops.visual_hull import project
 from gausim.render.draw import draw_still
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.plan import TrainingPlan
 
 TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
 PUSHED = ("flower", "pudding")
@@ -51,7 +52,7 @@ def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> N
 
 
 def test_set_is_read_by_the_data_module(made: Path) -> None:
-    data = ReadyDataModule(made, batch_size=4, repeats=1)
+    data = ReadyDataModule(made, plan=TrainingPlan(t_start=1, t_max=5, batch_size=4, repeats=1))
     data.setup("fit")
     (batch,) = list(data.train_dataloader())
     assert sorted(s.object_name for s in batch) == ["flower_soft"] * 2 + ["pudding_soft"] * 2
