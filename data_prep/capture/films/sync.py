@@ -108,7 +108,7 @@ def align(
             shortest, longest = (1000 * interval for interval in films[name].intervals)
             raise DataError(
                 f"{name} ({films[name].path.name}): output frame {worst}: its nearest ({best.frames[name][worst]}) is "
-                f" {residual[worst]:+.2f} frames from its place on the times of {best.reference}, allowed {LIMIT:g}. "
+                f"{residual[worst]:+.2f} frames from its place on the times of {best.reference}, allowed {LIMIT:g}. "
                 f"Check its offset and rate. If the rate varies or frames are missing (they come {shortest:.1f} to "
                 f"{longest:.1f} ms apart), cut the film before the gap (--start, --duration)."
             )
