@@ -31,7 +31,7 @@ def stand_in(directory: Path, root: Path, *, model: object, **parts: object) -> 
     run = object.__new__(LoadedRun)  # without its checks of types, which parts of our own would not pass
     vars(run).update(
         config={"name": "toy", "seed": 5, "model": {"modes": 6}}, run_dir=directory, objects=[ObjectData(root)],
-        module=SimpleNamespace(model=model, simulator=model, **facts, **parts), renderer=ReferenceRenderer(),
+        module=SimpleNamespace(model=model, scenes=model.scenes, **facts, **parts), renderer=ReferenceRenderer(),
     )  # fmt: skip
     return run
 

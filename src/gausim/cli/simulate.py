@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 from gausim.cli.arguments import (
@@ -26,9 +27,10 @@ def main(argv: list[str]) -> int:
     if (arguments.run is None) == (arguments.scene is None):
         raise ConfigError("expected a RUN, or --scene SCENE.ply and the run whose network moves it, --from RUN.")
     # Sides pin the scene before it begins, parts during the simulation.
-    sides = [" ".join(words) for words in arguments.pin if "=" not in words[0] or words[0][:2] in ("x=", "y=", "z=")]
-    arguments.pin, arguments.sides = [words for words in arguments.pin if " ".join(words) not in sides], sides
-    if arguments.run is not None and (sides or arguments.base):
+    given = [" ".join(words) for words in arguments.pin]
+    arguments.sides = [text for text in given if re.match(r"(below|above)\b|[xyz]\s*=", text)]
+    arguments.pin = [text.split() for text in given if text not in arguments.sides]
+    if arguments.run is not None and (arguments.sides or arguments.base):
         raise ConfigError("--pin SIDE and --from: expected with --scene only. A run has its pins and its network.")
     from gausim.cli.simulate_run import simulate_run, simulate_scene
 
