@@ -86,3 +86,21 @@ def test_what_a_finished_run_says_is_checked(tmp_path: Path) -> None:
         (tmp_path / "FINISHED").write_text(wrong)
         with pytest.raises(RunError, match="FINISHED: expected facts of a finished run"):
             run.facts()
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_a_new_run_that_fails_before_its_first_step_leaves_nothing(tmp_path: Path, stepped: bool) -> None:
+    run = RunDirectory(tmp_path / "out" / "name" / "seed_0")
+    (run.path / ".hydra").mkdir(parents=True)
+    (run.path / ".hydra" / "config.yaml").write_text("")
+    with pytest.raises(ZeroDivisionError), run.leaving_no_trace(tmp_path / "out"), run.recording_failure():
+        run.prepare(CONFIG)
+        run.has_stepped = stepped
+        1 / 0  # noqa: B018
+    assert (tmp_path / "out").exists() == stepped == run.has_failed
+    again = RunDirectory(run.path)
+    (tmp_path / "out" / "name" / "seed_0").mkdir(parents=True, exist_ok=True)
+    (run.path / "notes.txt").write_text("mine")
+    with pytest.raises(ZeroDivisionError), again.leaving_no_trace(tmp_path / "out"):
+        1 / 0  # noqa: B018
+    assert (run.path / "notes.txt").read_text() == "mine" and again.has_failed == stepped

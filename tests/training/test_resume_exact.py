@@ -28,7 +28,7 @@ def test_a_run_killed_while_it_saves_equals_an_uninterrupted_one(trainings: Trai
     run, settings = trainings.run("cut"), (*THREE, "trainer.checkpoint_steps=4")
     # Between naming the predecessor and the successor of the checkpoint at the end of the second epoch.
     assert trainings("cut", *settings, **killed("os.replace", 4, match=".last.ckpt."))[0] == -9
-    assert step_of(run) == step_of(run, "last.previous.ckpt") == 10
+    assert not (run / "last.ckpt").exists() and step_of(run, "last.previous.ckpt") == 10
     status, output = trainings("cut", *settings)
     assert status == 0 and "resuming on cpu (1 torch thread)" in output, output
     assert_same_run(run, toy_run)

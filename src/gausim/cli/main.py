@@ -83,6 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in ("-V", "--version"):
         print(f"gausim {__version__}")
         return 0
+    if name == "-sc":  # a shell that completes a line of `gausim train`, by Hydra's function for it
+        line = os.environ.get("COMP_LINE", "")
+        os.environ["COMP_LINE"] = line.replace(" train ", " ", 1)
+        return _run("train", [name, *rest]) if " train " in line else 0
     if name not in COMMANDS:
         print(_unknown(name) if name else usage(), file=sys.stderr)
         return EXIT_USAGE

@@ -14,6 +14,7 @@ from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.compose.ablations import check_ablations
@@ -57,30 +58,33 @@ def run_hydra(task: Callable[[DictConfig], float | None], argv: Sequence[str]) -
             for number, own in enumerate(jobs_of(words)):
                 print(f"---\n# job {number}: {' '.join(own)}\n{OmegaConf.to_yaml(compose(own))}", end="")
             return 0
-        if not (given.shell_completion or given.info or given.cfg):
+        runs, saved = not (given.shell_completion or given.info or given.cfg), given.config_name
+        if runs and not saved:
             _check(words, sweep=sweep)
         version.setbase(HYDRA_VERSION_BASE)
-        path = create_config_search_path(str(conf_dir()))
-        hydra = Hydra.create_main_hydra2(task_name=ROOT_FILE, config_search_path=path)
+        path = create_config_search_path(str(folders[0] if saved and folders else conf_dir()))
+        hydra, name = Hydra.create_main_hydra2(task_name=ROOT_FILE, config_search_path=path), saved or ROOT_FILE
         try:
             if given.shell_completion:
-                hydra.shell_completion(ROOT_FILE, words)
+                hydra.shell_completion(name, words)
             elif given.info:
-                hydra.show_info(given.info, ROOT_FILE, words)
+                hydra.show_info(given.info, name, words)
             elif given.cfg:
-                hydra.show_cfg(ROOT_FILE, words, given.cfg, given.package, given.resolve)
+                hydra.show_cfg(name, words, given.cfg, given.package, given.resolve)
             else:
-                _run(hydra, Job(task), words, sweep=sweep)
+                _run(hydra, name, Job(task), words, sweep=sweep)
         finally:
             GlobalHydra.instance().clear()
     return 0
 
 
-def _run(hydra: Hydra, job: Job, words: Sequence[str], *, sweep: bool) -> None:
+def _run(hydra: Hydra, name: str, job: Job, words: list[str], *, sweep: bool) -> None:
+    if name != ROOT_FILE:  # the configuration that a run has saved
+        check_hydra(hydra.compose_config(name, words, run_mode=RunMode.RUN, with_log_configuration=False).hydra)
     if sweep:
-        hydra.multirun(ROOT_FILE, job, [*words, "hydra.mode=MULTIRUN"])
+        hydra.multirun(name, job, [*words, "hydra.mode=MULTIRUN"])
     else:
-        hydra.run(ROOT_FILE, job, [*words, "hydra.mode=RUN"])
+        hydra.run(name, job, [*words, "hydra.mode=RUN"])
     if job.error is not None:
         raise job.error
 

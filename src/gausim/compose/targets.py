@@ -40,8 +40,8 @@ REFUSED_MODULES = (
     "gausim.report",
     "lightning.pytorch.strategies.launchers",
 )
-# Allowed in the node `hydra`: launchers, our sweeper, which launches only jobs that were checked, and callbacks.
-HYDRA_PACKAGES = ("hydra._internal.core_plugins.basic_launcher", "hydra_plugins", "gausim")
+# Allowed in the node `hydra`: launchers, sweepers and callbacks.
+HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim")
 _LOGGING_CLASS = re.compile(r"(logging|logging\.handlers|colorlog)\.[A-Z]\w*")
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
