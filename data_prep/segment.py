@@ -55,7 +55,7 @@ def segment(
     inputs = {source.name: source} if film else {**pictures, **carried}
     inputs |= {f"backend/{name}": path for name, path in backend.inputs.items()}
     settings = {"backend": backend.name, **backend.settings, "cleanup": asdict(cleanup), "kind": kind, "every": every}
-    packages = ("av", "numpy", "opencv-python-headless", *backend.packages)
+    packages = ("av", "numpy", "opencv-python-headless")
 
     def make(work: Path) -> dict[str, Any]:
         found = clips

@@ -92,14 +92,6 @@ def names(text: str) -> tuple[str, ...]:
     return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def numbers(text: str) -> tuple[float, ...]:
-    """Finite numbers between commas."""
-    values = tuple(float(part) for part in text.split(","))
-    if not all(math.isfinite(value) for value in values):
-        raise argparse.ArgumentTypeError("must be finite")
-    return values
-
-
 def cores() -> int:
     """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -37,7 +37,6 @@ class Backend:
     soft: bool = False  # masks have soft edges of their own; others are softened along the picture's edges
     settings: Mapping[str, Any] = field(default_factory=dict)  # what was chosen (plain data)
     inputs: Mapping[str, Path] = field(default_factory=dict)  # files it reads besides the pictures
-    packages: tuple[str, ...] = ()  # libraries whose versions may matter
 
 
 def alpha_masks(clip: Clip) -> MaskOf:
