@@ -176,8 +176,8 @@ class ModalInitialStates(InitialStates):
     def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
         """Sets the amplitudes by least squares."""
         basis = self._basis[self.scene_of_sequence[sequence_id]].to(motion).double().flatten(0, 1)
-        found = torch.linalg.solve(basis.mT @ basis, basis.mT @ motion.double().flatten()).float()
-        self.velocity[sequence_id][: len(found)] = found
+        amplitudes = torch.linalg.solve(basis.mT @ basis, basis.mT @ motion.double().flatten()).float()
+        self.velocity[sequence_id][: len(amplitudes)] = amplitudes
 
     def reach(self, change: float) -> float:
         """Displacement of x_{-1} when v_0 changes by ``change``, smallest over the scenes [diagonals]."""

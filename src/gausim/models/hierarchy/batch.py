@@ -136,12 +136,12 @@ class SceneBatch:
     @cached_property
     def rows_by_scene(self) -> tuple[tuple[int, Int[Tensor, " R"], list[int]], ...]:
         """For each scene its index, the rows of its members' finest units, and the members."""
-        spans, found = self.levels[-1].spans, []
+        spans, by_scene = self.levels[-1].spans, []
         for scene_id in sorted(set(self.scene_ids)):
             members = [i for i, s in enumerate(self.scene_ids) if s == scene_id]
             rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
-            found.append((scene_id, rows.to(self.rest.device), members))
-        return tuple(found)
+            by_scene.append((scene_id, rows.to(self.rest.device), members))
+        return tuple(by_scene)
 
 
 class BatchBuilder:

@@ -110,9 +110,9 @@ def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float, clustering: 
     labels = torch.zeros(len(rest), dtype=torch.int64)
     offset = 0
     for mask in (group == number for number in group.unique()):
-        found = CLUSTERINGS[clustering](np.ascontiguousarray(rest[mask].numpy()), diameter)
-        labels[mask] = torch.from_numpy(found) + offset
-        offset += int(found.max()) + 1
+        group_labels = CLUSTERINGS[clustering](np.ascontiguousarray(rest[mask].numpy()), diameter)
+        labels[mask] = torch.from_numpy(group_labels) + offset
+        offset += int(group_labels.max()) + 1
     return labels
 
 

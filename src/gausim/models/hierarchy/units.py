@@ -49,11 +49,11 @@ def weighted_sum(
 
 def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tensor, "N C"]) -> list[Tensor]:
     """Values of every predicted level, coarse to fine, such as positions: means of the finer units by mass."""
-    found = [finest]
+    values = [finest]
     for position in range(len(batch.levels) - 1, 0, -1):
         level, count = batch.levels[position], batch.levels[position - 1].count
-        found.insert(0, weighted_sum(found[0], fractions[position], level.parent, count))
-    return found
+        values.insert(0, weighted_sum(values[0], fractions[position], level.parent, count))
+    return values
 
 
 def fixed_units(

@@ -214,11 +214,11 @@ class Contact:
                 return torch.zeros_like(wanted), torch.zeros_like(guess)
             friction = float(self.friction)
             solved = _projected_gradients(spread.double(), wanted.double(), friction, guess)
-            found = solved.view(-1, 3)
-            size = found[:, 1:].norm(dim=1)
-            pressing = found[:, 0] > 1e-9 * found[:, 0].max().clamp_min(1e-30)
-            sliding = pressing & (size >= SLIDING * friction * found[:, 0])
-            direction = (found[:, 1:] / size.clamp_min(1e-30)[:, None]).to(wanted)
+            impulses = solved.view(-1, 3)
+            size = impulses[:, 1:].norm(dim=1)
+            pressing = impulses[:, 0] > 1e-9 * impulses[:, 0].max().clamp_min(1e-30)
+            sliding = pressing & (size >= SLIDING * friction * impulses[:, 0])
+            direction = (impulses[:, 1:] / size.clamp_min(1e-30)[:, None]).to(wanted)
         if not torch.is_grad_enabled():
             return solved.to(wanted), solved
         softer = _softer(spread, GRADIENT_COMPLIANCE)

@@ -89,12 +89,12 @@ def reference_of(
         axes: axes of the template's modes, as rows, per unit.
         driven: let the pins of every scene move; those without recorded hands are one hand.
     """
-    known = [cast(SceneSurroundings, surroundings[i]) for i in batch.scene_ids]
-    if not driven and not any(own.moves for own in known):
+    scenes = [cast(SceneSurroundings, surroundings[i]) for i in batch.scene_ids]
+    if not driven and not any(own.moves for own in scenes):
         return Reference(batch, units.rest)
     masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
     bodies: list[Body] = []
-    for number, (member, span, own) in enumerate(zip(batch.members, batch.levels[-1].spans, known, strict=True)):
+    for number, (member, span, own) in enumerate(zip(batch.members, batch.levels[-1].spans, scenes, strict=True)):
         if not (driven or own.moves):
             bodies.append(Body(units.rest[span]))
             continue

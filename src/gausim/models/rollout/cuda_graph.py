@@ -60,9 +60,9 @@ class GraphedStep:
             self._force.copy_(force)
         if pushed not in self._graphs:
             self._graphs[pushed] = self._record(pushed)
-        graph, made = self._graphs[pushed]
+        graph, frame = self._graphs[pushed]
         graph.replay()
-        return Frame(made.positions.clone(), made.deformation_gradients.clone(), made.rotations.clone())
+        return Frame(frame.positions.clone(), frame.deformation_gradients.clone(), frame.rotations.clone())
 
     def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, Frame]:
         force = self._force if pushed else None

@@ -154,14 +154,14 @@ class SceneStepper:
             self._note(1, force)
         self._ask(now=False)
         with evaluating(self._model):
-            made = (self._step if self._guard is None else self._guard.step)(self.state, force)
-        positions = made.positions
+            frame = (self._step if self._guard is None else self._guard.step)(self.state, force)
+        positions = frame.positions
         if held is not None:
             positions = torch.where(held[:, None], self.state.positions, positions)
         self._number += 1
         self._note(0, positions)
-        self.state = SimState(positions, made.following(self.state).previous)
-        self.frame = Frame(positions, made.deformation_gradients, made.rotations)
+        self.state = SimState(positions, frame.following(self.state).previous)
+        self.frame = Frame(positions, frame.deformation_gradients, frame.rotations)
         return self.frame
 
     def settle(self) -> None:

@@ -85,12 +85,12 @@ class EnergyGuard:
     def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Frame, float]:
         """The template's step with the largest tried fraction of the force below the ceiling, or without the force."""
         for scale in WEAKER:
-            made, energy = self._corrected(state, scale * force if scale else None, 0.0)
+            frame, energy = self._corrected(state, scale * force if scale else None, 0.0)
             if energy <= ceiling:
                 break
-        return made, energy
+        return frame, energy
 
-    def _cut_short(self, made: Frame, state: SimState, ceiling: float) -> tuple[Frame, float]:
+    def _cut_short(self, frame: Frame, state: SimState, ceiling: float) -> tuple[Frame, float]:
         """The longest fraction of a step below the ceiling (at least the energy of standing still), by bisection.
 
         Both E in motion and E at rest at the end must stay below: E is evaluated at the midpoint of a step, and the
@@ -100,20 +100,20 @@ class EnergyGuard:
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             scale = (low + high) / 2
-            x = self._part(made, state, scale).positions
+            x = self._part(frame, state, scale).positions
             needed = max(self._energy(SimState(x, state.positions)), self._energy(SimState(x, x)))
             low, high = (scale, high) if needed <= limit else (low, scale)
-        part = self._part(made, state, low)
+        part = self._part(frame, state, low)
         return part, self._energy(part.following(state))
 
-    def _part(self, made: Frame, state: SimState, scale: float) -> Frame:
-        positions = state.positions + scale * (made.positions - state.positions)
+    def _part(self, frame: Frame, state: SimState, scale: float) -> Frame:
+        positions = state.positions + scale * (frame.positions - state.positions)
         if self._last_frame is None:  # the first step: from G = I
-            before = turned = torch.eye(3).to(positions).expand_as(made.deformation_gradients)
+            before = turned = torch.eye(3).to(positions).expand_as(frame.deformation_gradients)
         else:
             before, turned = self._last_frame.deformation_gradients, self._last_frame.rotations
-        deformation_gradients = before + scale * (made.deformation_gradients - before)
-        rotations = polar_rotation(turned + scale * (made.rotations - turned))
+        deformation_gradients = before + scale * (frame.deformation_gradients - before)
+        rotations = polar_rotation(turned + scale * (frame.rotations - turned))
         return Frame(positions, deformation_gradients, rotations)
 
     def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Frame, float]:
@@ -121,12 +121,12 @@ class EnergyGuard:
         alone, lowest = self._corrected(state, force, 0.0)
         if lowest >= limit:
             return alone, lowest
-        part, found = self._corrected(state, force, (limit - lowest) / (energy - lowest))
-        return (part, found) if found <= limit else (alone, lowest)
+        part, reached = self._corrected(state, force, (limit - lowest) / (energy - lowest))
+        return (part, reached) if reached <= limit else (alone, lowest)
 
     def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[Frame, float]:
-        made = self._model.step(self._prepared.batch, state, force, self._prepared, scale)
-        return made, self._energy(made.following(state))
+        frame = self._model.step(self._prepared.batch, state, force, self._prepared, scale)
+        return frame, self._energy(frame.following(state))
 
     def _energy(self, state: SimState) -> float:
         return float(self._model.energy(self._prepared.batch, state, self._prepared))

@@ -19,16 +19,16 @@ from gausim.nn.normaliser import RunningNormaliser
 READS_NODES = "node_encoder.0.weight"
 
 
-def with_floor_columns(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Weights by name for a model with the shapes of ``own``, with or without the columns of the floor's features.
+def with_floor_columns(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights by name for a model with the shapes of ``expected``, with or without the columns of the floor's features.
 
     Both keep the function: new columns are zero, and the features of removed ones are zero without a floor.
     """
-    fitting = dict(found)
-    for name in found.keys() & own.keys():
-        if name.endswith(READS_NODES) and abs(own[name].shape[1] - found[name].shape[1]) == FLOOR_FEATURES:
+    fitting = dict(weights)
+    for name in weights.keys() & expected.keys():
+        if name.endswith(READS_NODES) and abs(expected[name].shape[1] - weights[name].shape[1]) == FLOOR_FEATURES:
             # A negative number of columns removes the last ones.
-            fitting[name] = nn.functional.pad(found[name], (0, own[name].shape[1] - found[name].shape[1]))
+            fitting[name] = nn.functional.pad(weights[name], (0, expected[name].shape[1] - weights[name].shape[1]))
     return fitting
 
 

@@ -211,11 +211,11 @@ class SceneModel(nn.Module, ABC):
         """
         batch = self.batch((scene_id,))
         finest = self.units(batch)[-1][-1]
-        known, free = self.template.material(scene_id, finest, self.fps[scene_id]), ~batch.levels[-1].pinned
+        properties, free = self.template.material(scene_id, finest, self.fps[scene_id]), ~batch.levels[-1].pinned
         width = MAP_WIDTH * self.scenes[scene_id].diagonal
         return {
-            name: Property(local_means(found.values, finest.rest.to(found.values), free, width), found.text)
-            for name, found in known.items()
+            name: Property(local_means(learned.values, finest.rest.to(learned.values), free, width), learned.text)
+            for name, learned in properties.items()
         }
 
     @torch.no_grad()
@@ -225,14 +225,14 @@ class SceneModel(nn.Module, ABC):
         Each kernel has the value of its finest predicted unit (:meth:`material_of_units`); NaN for kernels that never
         move.
         """
-        batch, scene, known = self.batch((scene_id,)), self.scenes[scene_id], self.material_of_units(scene_id)
+        batch, scene, properties = self.batch((scene_id,)), self.scenes[scene_id], self.material_of_units(scene_id)
 
         def of_kernels(values: Tensor) -> Tensor:
             every = torch.full((scene.count,), torch.nan)
             every[batch.simulated.cpu()] = values[batch.levels[-1].unit_of_kernel].float().cpu()
             return torch.where(scene.simulated.cpu() & ~scene.pinned.cpu(), every, torch.nan)
 
-        return {name: Property(of_kernels(found.values), found.text) for name, found in known.items()}
+        return {name: Property(of_kernels(learned.values), learned.text) for name, learned in properties.items()}
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by role: the network, densities and attributes, and the template's, shared or of scenes."""

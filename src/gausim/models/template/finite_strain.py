@@ -128,10 +128,10 @@ def _measures() -> Float[Tensor, "9 63"]:
 
     By rows F_ij, by columns measure and H_kl.
     """
-    found = torch.zeros(3, 3, 7, 3, 3)
+    maps = torch.zeros(3, 3, 7, 3, 3)
     for number, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))):
         for k in range(3):
             for first, second in ((i, j), (j, i)):
-                found[k, first, number, k, second] += 0.5 if i == j else 0.5**0.5
-    found[:, :, 6] = found[:, :, :3].sum(2)
-    return found.flatten(2).flatten(0, 1)
+                maps[k, first, number, k, second] += 0.5 if i == j else 0.5**0.5
+    maps[:, :, 6] = maps[:, :, :3].sum(2)
+    return maps.flatten(2).flatten(0, 1)

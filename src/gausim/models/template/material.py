@@ -151,10 +151,10 @@ class MaterialTemplate(Template):
             )
         self.conserve_volume = conserve_volume
         self.links, self.solid, self.laws = links, solid, [h.law for h in hierarchies]
-        made = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours)
+        body_modes = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours)
         counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
         self.bodies = nn.ModuleList(
-            made(h, frame=f, modes=count, finite=h.law == "solid")
+            body_modes(h, frame=f, modes=count, finite=h.law == "solid")
             for h, f, count in zip(hierarchies, frames, counts, strict=True)
         )
         if damping.drag < 0 or damping.viscosity <= 0:
@@ -261,23 +261,23 @@ class MaterialTemplate(Template):
         for end in body.springs.ends:
             own = own.index_add(0, end, factors * size)
             homogeneous = homogeneous.index_add(0, end, (self.links.linear + strength) * size)
-        found = {
+        properties = {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
         if self.has_drag(scene_id):
             drag = REFERENCE_FPS * self._damping(scene_id)[0] * decoded[:, 2].exp()
-            found["damping"] = Property(drag, "drag over momentum [1/s]")
-        return found
+            properties["damping"] = Property(drag, "drag over momentum [1/s]")
+        return properties
 
     @torch.no_grad()
     def slowest_period(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"]
     ) -> float:
         """Period of the slowest mode of a scene of undamped small motions [s], from its units' material."""
-        found = self.matrices(scene_id, log_density, attributes, 1 / REFERENCE_FPS)
-        root = torch.linalg.inv(torch.linalg.cholesky(found.inertia))
-        squared = torch.linalg.eigvalsh(root @ found.stiffness @ root.mT)[0]
+        matrices = self.matrices(scene_id, log_density, attributes, 1 / REFERENCE_FPS)
+        root = torch.linalg.inv(torch.linalg.cholesky(matrices.inertia))
+        squared = torch.linalg.eigvalsh(root @ matrices.stiffness @ root.mT)[0]
         return 2 * math.pi / math.sqrt(float(squared)) / REFERENCE_FPS
 
     def shared(self, prefix: str) -> tuple[str, ...]:
@@ -287,12 +287,12 @@ class MaterialTemplate(Template):
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
 
-        def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
+        def prepared(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
             matrices = self.matrices(scene_id, density, attributes, batch.levels[-1].dt.index_select(0, rows[:1])[0, 0])
             return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.log_k))
 
-        return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
+        return PreparedScenes(batch, prepared, conserve_volume=self.conserve_volume)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """Modes (N, 3, M), displacement gradients (N, 3, 3, M) and sizes (M,): the basis of initial velocities."""

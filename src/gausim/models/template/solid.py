@@ -161,7 +161,7 @@ def solid_body(
     whole, carry = whole[used][:, used], sp.diags(root) @ carry
     solve = _solver(whole)
 
-    def made(eigenvalues: np.ndarray, vectors: np.ndarray, vibrations: int) -> SolidBody:
+    def body_of(eigenvalues: np.ndarray, vectors: np.ndarray, vibrations: int) -> SolidBody:
         # The signs of eigenvectors differ between machines. What is trained in the modes must mean the same on all.
         moved = carry @ vectors
         signs = np.sign(moved[np.abs(moved).argmax(0), np.arange(moved.shape[1])])
@@ -170,10 +170,10 @@ def solid_body(
         return SolidBody(grid, eigenvalues, field.reshape(3, grid.size, -1), body.centres, body.weights, vibrations)
 
     eigenvalues, vectors = lowest(solve, carry, modes, rigid)
-    found = made(eigenvalues, vectors, len(eigenvalues))
+    vibrating = body_of(eigenvalues, vectors, len(eigenvalues))
     if not curved:
-        return found
-    return made(*_joined(vectors, derivatives(found, curved, solve, used, carry, rigid), whole, carry))
+        return vibrating
+    return body_of(*_joined(vectors, derivatives(vibrating, curved, solve, used, carry, rigid), whole, carry))
 
 
 def derivatives(

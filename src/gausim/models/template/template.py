@@ -154,12 +154,14 @@ class Template(nn.Module, ABC):
 class PreparedScenes(PreparedTemplate):
     """The template of a batch, scene by scene."""
 
-    def __init__(self, batch: SceneBatch, made: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool) -> None:
-        """Prepares every scene; ``made`` is called with its index and the rows of one member's units."""
+    def __init__(
+        self, batch: SceneBatch, prepare: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool
+    ) -> None:
+        """Prepares every scene; ``prepare`` is called with its index and the rows of one member's units."""
         super().__init__(batch)
         self._conserve_volume = conserve_volume
         self.parts = [
-            (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
+            (prepare(scene_id, rows[: len(rows) // len(members)]), rows, members)
             for scene_id, rows, members in batch.rows_by_scene
         ]
         order = torch.cat([rows for _, rows, _ in self.parts])
@@ -180,11 +182,11 @@ class PreparedScenes(PreparedTemplate):
 
     def __call__(self, motion: UnitMotion) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3 3"] | None]:
         """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
-        made = []
+        values = []
         for part, rows, members in self.parts:
             load = None if motion.load is None else self._members_of(motion.load, rows, members)
-            made.append(part(*self._displacements(motion, rows, members), load).flatten(0, 1))
-        moved = self._in_order(made)
+            values.append(part(*self._displacements(motion, rows, members), load).flatten(0, 1))
+        moved = self._in_order(values)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return motion.rest + moved[:, :3], deformation
@@ -198,21 +200,21 @@ class PreparedScenes(PreparedTemplate):
 
     def carried(self, motion: UnitMotion) -> UnitMotion:
         """The part of the motion that is input to template and network, scene by scene."""
-        made = []
+        values = []
         for part, rows, members in self.parts:
             both = torch.cat(self._displacements(motion, rows, members))
-            made.append(torch.stack([x.flatten(0, 1) for x in part.carried(both).chunk(2)]))
-        seen = made[0] if len(made) == 1 else torch.cat(made, 1).index_select(1, self._places)
+            values.append(torch.stack([x.flatten(0, 1) for x in part.carried(both).chunk(2)]))
+        seen = values[0] if len(values) == 1 else torch.cat(values, 1).index_select(1, self._places)
         return replace(motion, now=motion.rest + seen[0], before=motion.rest + seen[1])
 
     def overshoot(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The part of a displacement by an impulse that its frame does not reach, scene by scene."""
         parts = [part.overshoot(self._members_of(displacement, rows, members)) for part, rows, members in self.parts]
-        return self._in_order([made.flatten(0, 1) for made in parts])
+        return self._in_order([values.flatten(0, 1) for values in parts])
 
-    def _in_order(self, made: list[Tensor]) -> Tensor:
+    def _in_order(self, values: list[Tensor]) -> Tensor:
         """Values of the units, scene by scene, in the order of the batch."""
-        return made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
+        return values[0] if len(values) == 1 else torch.cat(values).index_select(0, self._places)
 
     def energy(self, motion: UnitMotion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
@@ -221,8 +223,8 @@ class PreparedScenes(PreparedTemplate):
     def dissipated(self, motion: UnitMotion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
         """Energy that the damping takes from every member in a step from ``previous`` to the end of ``motion``."""
         earlier = self._coordinates(replace(motion, before=previous))
-        found = zip(self._coordinates(motion), earlier, strict=True)
-        return self._by_member([part.dissipated(*z, before) for (part, z), (_, (_, before)) in found])
+        values = zip(self._coordinates(motion), earlier, strict=True)
+        return self._by_member([part.dissipated(*z, before) for (part, z), (_, (_, before)) in values])
 
     def _coordinates(self, motion: UnitMotion) -> list[tuple[ModalScene, tuple[Tensor, Tensor]]]:
         return [
@@ -231,16 +233,16 @@ class PreparedScenes(PreparedTemplate):
 
     def correction_unit(self) -> Float[Tensor, " S"] | None:
         """Factor on the network's output of every member of the batch; None for a factor of 1."""
-        made = []
+        values = []
         for part, _, members in self.parts:
             unit = part.correction_unit()
             if unit is None:
                 return None
-            made.append(unit.expand(len(members)))
-        return self._by_member(made)
+            values.append(unit.expand(len(members)))
+        return self._by_member(values)
 
-    def _by_member(self, found: list[Tensor]) -> Tensor:
-        joined = torch.cat(found)
+    def _by_member(self, values: list[Tensor]) -> Tensor:
+        joined = torch.cat(values)
         if len(self.parts) == 1:
             return joined
         order = [m for _, _, members in self.parts for m in members]
