@@ -42,7 +42,7 @@ def levels_of(scene: GaussianScene, units: Sequence[int]) -> str:
         low, high = 0.0, 1.0
         for _ in range(14):
             middle = 0.5 * (low + high)
-            count = build_hierarchy(scene, radii=(*found, middle), clustering="agglomerative").levels[-1].count
+            count = build_hierarchy(scene, radii=(*found, middle)).levels[-1].count
             if count == wanted:
                 break
             low, high = (middle, high) if count > wanted else (low, middle)

@@ -16,7 +16,6 @@ from gausim.cli import inspect as command
 from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.io.ply import load_scene, save_scene
-from gausim.models.settings import HierarchySettings
 from gausim.pictures import kernels
 
 
@@ -83,7 +82,6 @@ def test_wrong_options_are_explained(
 def test_the_default_hierarchy_is_that_of_the_model() -> None:
     levels = compose(["model=gausim"]).model.simulator.hierarchy.levels
     assert tuple(level.diameter for level in reversed(levels)) == command.DEFAULT_RADII
-    assert HierarchySettings.clustering == command.DEFAULT_CLUSTERING
 
 
 @pytest.mark.parametrize("name", ["stiffness", "damping"])

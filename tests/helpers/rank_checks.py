@@ -45,7 +45,7 @@ def cast(record: Any, dtype: torch.dtype) -> Any:
 def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSettings) -> GausSimModule:
     torch.manual_seed(0)
     scenes = [cast(toy_object.toy_scene(), dtype) for _ in range(2)]
-    model = gausim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), clustering="ball", output_scale=0.02)
+    model = gausim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), output_scale=0.02)
     module = GausSimModule(
         method=SharedSimulator(model, FreeInitialStates(model, SCENES), SCENES),
         renderer=ReferenceRenderer(),

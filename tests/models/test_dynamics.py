@@ -115,7 +115,6 @@ def test_a_device_is_asked_now_and_then_and_at_the_end() -> None:
         ({"radii": (-0.1, 0.3)}, "coarse to fine"),
         ({"predicted_levels": (), "graph_radii": ()}, "at least one"),
         ({"edges": "both"}, "'both'; expected one of rest, union, intersection"),
-        ({"clustering": "kmeans"}, "'kmeans'; expected one of ball, agglomerative"),
     ],
 )
 def test_contradicting_options_are_refused(options, message) -> None:

@@ -119,7 +119,7 @@ def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(dtype: 
 
 def test_parent_with_one_child_gives_a_finite_step_and_gradient() -> None:
     scene = make_scene(60)
-    model = make_model(scene, radii=(0.3, 0.35), clustering="ball")
+    model = make_model(scene, radii=(0.3, 0.35))
     batch = model.batch((0,))
     assert 1 in torch.bincount(batch.levels[1].parent).tolist()
     state = make_state(scene)

@@ -10,10 +10,9 @@ from gausim.ops.covariance import kernel_volumes
 RADII = (0.15, 0.35, 0.7)
 
 
-@pytest.mark.parametrize("clustering", ["agglomerative", "ball"])
-def test_every_unit_has_one_parent_of_its_own_kind_and_volumes_add_up(clustering) -> None:
+def test_every_unit_has_one_parent_of_its_own_kind_and_volumes_add_up() -> None:
     scene = make_scene(120, dtype=torch.float64)
-    hierarchy = build_hierarchy(scene, radii=RADII, clustering=clustering)
+    hierarchy = build_hierarchy(scene, radii=RADII)
     counts = [level.count for level in hierarchy.levels]
     assert counts[0] == int(scene.simulated.sum()) and counts == sorted(set(counts), reverse=True)
     volume = kernel_volumes(scene.log_scales, scene.volume_scale)[scene.simulated]

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from gausim.models.hierarchy.clusters import Hierarchy
 
 # The hierarchy of conf/model/gausim.yaml; composing it here would be slow.
-DEFAULT_RADII = (0.09, 0.4)
-DEFAULT_CLUSTERING = "agglomerative"
+DEFAULT_RADII = (0.125, 0.55)
 PROPERTIES = ("stiffness", "density", "damping")
 
 
@@ -34,7 +33,7 @@ def main(argv: list[str]) -> int:
         raise SceneError(f"--radii {arguments.radii}: expected fractions of the diagonal in (0, 1], fine to coarse.")
     scene = _marked(load_scene(arguments.scene, masks=arguments.masks), arguments)
     _print_scene(scene)
-    hierarchy = build_hierarchy(scene, radii=arguments.radii, clustering=arguments.clustering)
+    hierarchy = build_hierarchy(scene, radii=arguments.radii)
     _print_hierarchy(hierarchy, arguments.radii)
     out = arguments.out or Path(f"{arguments.scene.stem}.clusters.png")
     _draw(scene, hierarchy, arguments, out)
@@ -47,8 +46,6 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.ops.clustering import CLUSTERINGS
-
     parser = command_parser("inspect")
     add = parser.add_argument
     add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY), or a RUN with --property")
@@ -60,8 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
         help="bound the clusters' diameters per level, fine to coarse [diagonals of the simulated kernels' bounding "
         "box] (default: {:g} {:g}, as of model=gausim)".format(*DEFAULT_RADII))  # fmt: skip
-    add("--clustering", default=DEFAULT_CLUSTERING, choices=tuple(CLUSTERINGS),
-        help="cluster by this method (default: %(default)s, as of model=gausim)")  # fmt: skip
     add("--up", choices=UPS,
         help="draw this axis upwards (write --up=-y; default: away from the pins, else z)")  # fmt: skip
     add("--out", metavar="PICTURE.png", type=Path,

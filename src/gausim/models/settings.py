@@ -18,7 +18,6 @@ class HierarchySettings:
         levels: the predicted levels, coarse to fine: `diameter` of the clusters and `edge_length` of the graph, both as
             fractions of the object's diagonal. The last level may have diameter 0: its units are the kernels. A single
             level of diameter 0 means "without hierarchy".
-        clustering: as in :func:`gausim.models.hierarchy.clusters.build_hierarchy`.
         max_neighbours: edges per unit.
         edges: neighbours in ``rest`` space, or the ``union`` / ``intersection`` with those of the current state.
         body_frame: predict in body axes, so that the motion is equivariant to rotations and translations of the scene.
@@ -28,10 +27,9 @@ class HierarchySettings:
     """
 
     levels: Sequence[Mapping[str, float]] = (
-        {"diameter": 0.4, "edge_length": 2.0},
-        {"diameter": 0.09, "edge_length": 0.3},
+        {"diameter": 0.55, "edge_length": 2.0},
+        {"diameter": 0.125, "edge_length": 0.3},
     )
-    clustering: str = "agglomerative"
     max_neighbours: int = 8
     edges: str = "rest"
     body_frame: bool = True

@@ -6,14 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from gausim.kernels import agglomeration, kdtree
-from gausim.kernels.announce import announced
-
 LLOYD_ITERATIONS = 8
-# Agglomeration keeps every pair within the diameter in memory, 48 bytes each. With more pairs than this, points are
-# first merged into groups of at most these fractions of the diameter, the smallest that fits.
-MAX_PAIRS = 8_000_000
-GROUP_FRACTIONS = (0.0, 1 / 24, 1 / 16, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)
 
 
 def _canonical_order(points: np.ndarray) -> np.ndarray:
@@ -64,56 +57,6 @@ def ball_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.n
         np.maximum.at(reach, labels, np.linalg.norm(points - means[labels], axis=1))
         seeds = np.where((reach <= radius)[:, None], means, seeds)
     return _relabel(points, labels)
-
-
-def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
-    """Near-linear complete linkage cut at ``diameter`` [scene units]: no two members are farther apart.
-
-    The clusters are those of all pairs (except for ties) if at most 8 million pairs of
-    points lie within the diameter. With more pairs, neighbouring points are first merged into groups much smaller
-    than the diameter; the distance of two groups is that of their farthest points, so the bound holds exactly.
-    """
-    canonical = _canonical_order(points)
-    ordered = points[canonical]
-    distinct = np.ones(len(points), bool)
-    distinct[1:] = (ordered[1:] != ordered[:-1]).any(1)
-    x = np.ascontiguousarray(ordered[distinct].T, np.float64)
-    square = diameter * diameter
-    with announced("the clustering"):
-        depth, order, x, boxes = kdtree.build(x, 4)
-        ends, nodes, pairs = _close_groups(depth, x, boxes, diameter)
-        squares = agglomeration.cross_squares(depth, x, boxes, ends, nodes, pairs, square)
-        group_labels = agglomeration.complete_linkage(len(nodes), pairs, squares, square)
-    of_distinct = np.empty(len(order), np.int64)
-    of_distinct[order] = np.repeat(group_labels, np.diff(ends))
-    labels = np.empty(len(points), np.int64)
-    labels[canonical] = of_distinct[np.cumsum(distinct) - 1]
-    return _relabel(points, labels)
-
-
-def _close_groups(
-    depth: int, x: np.ndarray, boxes: np.ndarray, diameter: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Groups (``kdtree.compact_nodes``) and pairs of groups with representative points within the diameter."""
-    capacity = MAX_PAIRS
-    for fraction in GROUP_FRACTIONS:
-        ends, nodes = kdtree.compact_nodes(depth, x.shape[1], boxes, fraction * diameter)
-        # Any point may represent a group: the farthest points of two groups are at least as far apart.
-        some = np.ascontiguousarray(x[:, (ends[:-1] + ends[1:]) // 2])
-        some_depth, order, some, some_boxes = kdtree.build(some, 8)
-        pairs, complete = kdtree.close_pairs(some_depth, some, some_boxes, diameter * diameter, capacity)
-        if complete:
-            break
-    while not complete:
-        capacity *= 2
-        pairs, complete = kdtree.close_pairs(some_depth, some, some_boxes, diameter * diameter, capacity)
-    return ends, nodes, order[pairs]
-
-
-CLUSTERINGS = {
-    "ball": ball_clusters,
-    "agglomerative": agglomerative_clusters,
-}
 
 
 def k_means(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "count 3"]:

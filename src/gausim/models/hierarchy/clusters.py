@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gausim.core import ConfigError, GaussianScene
-from gausim.ops.clustering import CLUSTERINGS
+from gausim.core import GaussianScene
+from gausim.ops.clustering import ball_clusters
 from gausim.ops.covariance import kernel_volumes
 from gausim.ops.selection import require_pinned
 
@@ -61,7 +61,6 @@ def build_hierarchy(
     scene: GaussianScene,
     *,
     radii: Sequence[float],
-    clustering: str = "agglomerative",
     axes: np.ndarray | None = None,
 ) -> Hierarchy:
     """Clusters the simulated kernels level by level.
@@ -69,17 +68,12 @@ def build_hierarchy(
     Args:
         scene: the rest scene; at least one kernel must be pinned, unless it is free.
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
-        clustering: ``agglomerative`` (complete linkage in near-linear memory) or ``ball`` (a greedy cover; more
-            clusters).
         axes: (3, 3), rows are the axes of the bounding box whose diagonal is the unit of length; the scene's axes when
             None. With body axes the units do not depend on the orientation of the scene.
 
     Raises:
         SceneError: no pinned kernel, or no free simulated kernel.
-        ConfigError: unknown clustering.
     """
-    if clustering not in CLUSTERINGS:
-        raise ConfigError(f"hierarchy.clustering is '{clustering}'; expected one of {', '.join(CLUSTERINGS)}.")
     require_pinned(scene)
     index = scene.simulated.nonzero()[:, 0].cpu()
     rest = scene.means.cpu()[index].double()
@@ -97,7 +91,7 @@ def build_hierarchy(
         top = number == len(radii)
         parent = torch.zeros(0, dtype=torch.int64)
         if not top:
-            parent = _cluster_by_group(rest, group, radii[number] * diagonal, clustering)
+            parent = _cluster_by_group(rest, group, radii[number] * diagonal)
         levels.append(Level(rest.to(scene.means.dtype), volume.to(scene.means.dtype), pinned, parent, root))
         if not top:
             rest, volume, group = _coarsen(rest, volume, group, parent)
@@ -105,12 +99,12 @@ def build_hierarchy(
     return Hierarchy(tuple(levels), index, diagonal, scene.law)
 
 
-def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float, clustering: str) -> Tensor:
+def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float) -> Tensor:
     """Labels of clusters within each group; those of free units, group 0, are numbered first."""
     labels = torch.zeros(len(rest), dtype=torch.int64)
     offset = 0
     for mask in (group == number for number in group.unique()):
-        group_labels = CLUSTERINGS[clustering](np.ascontiguousarray(rest[mask].numpy()), diameter)
+        group_labels = ball_clusters(np.ascontiguousarray(rest[mask].numpy()), diameter)
         labels[mask] = torch.from_numpy(group_labels) + offset
         offset += int(group_labels.max()) + 1
     return labels

@@ -65,8 +65,7 @@ class SceneModel(nn.Module, ABC):
         self.body_axes = [body_axes(s) if settings.body_frame else np.eye(3) for s in scenes]
         self.hierarchies = tuple(
             build_hierarchy(
-                scene, radii=settings.diameters, clustering=settings.clustering,
-                axes=own if settings.body_frame else None,
+                scene, radii=settings.diameters, axes=own if settings.body_frame else None,
             )
             for scene, own in zip(scenes, self.body_axes, strict=True)
         )  # fmt: skip
