@@ -83,6 +83,7 @@ def build_hierarchy(
     group = torch.where(pinned, 1, 0) if scene.hand is None else torch.where(pinned, scene.hand.cpu()[index] + 2, 0)
     # The root of a body that nothing holds is the kernel nearest to the mean.
     roots = (pinned.nonzero()[:, 0] if pinned.any() else (rest - rest.mean(0)).norm(dim=1).argmin()[None]).numpy()
+    own = np.eye(3) if axes is None else axes
     diagonal = scene.diagonal if axes is None else float(np.linalg.norm(np.ptp(rest.numpy() @ axes.T, axis=0)))
     tree = cKDTree(rest[roots].numpy())
     levels = []
@@ -91,7 +92,7 @@ def build_hierarchy(
         top = number == len(radii)
         parent = torch.zeros(0, dtype=torch.int64)
         if not top:
-            parent = _cluster_by_group(rest, group, radii[number] * diagonal)
+            parent = _cluster_by_group(rest.numpy() @ own.T, group, radii[number] * diagonal)
         levels.append(Level(rest.to(scene.means.dtype), volume.to(scene.means.dtype), pinned, parent, root))
         if not top:
             rest, volume, group = _coarsen(rest, volume, group, parent)
@@ -99,12 +100,12 @@ def build_hierarchy(
     return Hierarchy(tuple(levels), index, diagonal, scene.law)
 
 
-def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float) -> Tensor:
+def _cluster_by_group(rest: np.ndarray, group: Tensor, diameter: float) -> Tensor:
     """Labels of clusters within each group; those of free units, group 0, are numbered first."""
     labels = torch.zeros(len(rest), dtype=torch.int64)
     offset = 0
     for mask in (group == number for number in group.unique()):
-        group_labels = ball_clusters(np.ascontiguousarray(rest[mask].numpy()), diameter)
+        group_labels = ball_clusters(np.ascontiguousarray(rest[mask.numpy()]), diameter)
         labels[mask] = torch.from_numpy(group_labels) + offset
         offset += int(group_labels.max()) + 1
     return labels
