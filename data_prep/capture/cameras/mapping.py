@@ -1,7 +1,7 @@
 """Poses from photos by COLMAP's structure from motion (pycolmap, on the CPU), in steps that can be interrupted.
 
-Features are one file per photo, matches are written to the database a few pairs at a time, and the mapping itself takes
-a small part of the time. With one thread and one seed the same photos give the same poses.
+Features are written to the database photo by photo, matches a few pairs at a time, and the mapping itself takes a small
+part of the time. With one thread and one seed the same photos give the same poses.
 """
 
 from __future__ import annotations
@@ -20,11 +20,9 @@ import pycolmap
 from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, reduced
 from data_prep.common.progress import Tick
-from data_prep.common.stage import write_npz
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import PARAMETERS
-from gausim.io.files import replacing, write_durably
-from gausim.io.npz import read_npz
+from gausim.io.files import write_durably
 
 SEED = 0
 # Folder of what only an interrupted run needs.
@@ -80,64 +78,58 @@ def map_photos(
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     if len(photos) < _SMALLEST_MODEL:
         raise DataError(f"{len(photos)} photos: expected at least {_SMALLEST_MODEL}; the paper takes 200.")
-    for i, photo in enumerate(photos):
-        _extract(photo, work, options, tick, i, len(photos))
     database = work / SCRATCH / "database.db"
-    if not database.is_file():
-        _fill(database, photos, cameras, work, options)
+    database.parent.mkdir(parents=True, exist_ok=True)
+    _find_features(database, photos, cameras, options, tick)
     _match(database, photos, work, options, tick)
     folder = work / "colmap" / "sparse" / "0"
     sizes = _mapped(database, photos, folder, options, tick)
     return folder, sizes[1:]
 
 
-def _features_file(work: Path, number: int) -> Path:
-    return work / SCRATCH / f"{number:06d}.npz"
-
-
-def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, number: int, total: int) -> None:
-    """Writes the features of one photo, unless they are there."""
-    path = _features_file(work, number)
-    if not path.is_file():
-        gray = reduced(cv2.cvtColor(photo.read(), cv2.COLOR_RGBA2GRAY), options.feature_size)
-        settings = pycolmap.FeatureExtractionOptions()
-        settings.num_threads, settings.use_gpu, settings.max_image_size = options.threads, False, max(gray.shape)
-        settings.sift.max_num_features = options.features
-        if options.thorough:
-            settings.sift.estimate_affine_shape = settings.sift.domain_size_pooling = True
-            settings.sift.peak_threshold *= _WEAKER
-        extractor = pycolmap.FeatureExtractor.create(settings, pycolmap.Device.cpu)
-        found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(gray))
-        keypoints = np.array(pycolmap.keypoints_to_matrix(found), np.float32).reshape(-1, 4)
-        keypoints[:, :2] *= np.array([photo.width / gray.shape[1], photo.height / gray.shape[0]], np.float32)
-        write_npz(path, keypoints=keypoints, descriptors=np.array(descriptors.data, np.uint8))
-    tick("features", number + 1, total)
-
-
-def _fill(path: Path, photos: Sequence[Photo], cameras: Mapping[str, str], work: Path, options: MappingOptions) -> None:
-    """Writes COLMAP's database: cameras, photos (named by their number) and features."""
+def _find_features(
+    path: Path, photos: Sequence[Photo], cameras: Mapping[str, str], options: MappingOptions, tick: Tick
+) -> None:
+    """Writes cameras, photos (named by their number) and their features to COLMAP's database, unless they are there."""
     known: dict[tuple, int] = {}
-    for rest in path.parent.glob(f".{path.stem}.tmp*"):
-        rest.unlink()  # of an attempt that was killed
-    with replacing(path, typed=True) as temporary:
-        with pycolmap.Database.open(temporary) as database:
-            for i, photo in enumerate(photos):
-                focal = options.focal or photo.focal
-                key = (cameras[photo.name], photo.width, photo.height, focal)
-                if key not in known or options.intrinsics == "per-image":
-                    guess = focal or _FOCAL_GUESS * max(photo.width, photo.height)
-                    camera = pycolmap.Camera.create_from_model_name(
-                        len(known) + 1, options.camera_model, guess, photo.width, photo.height
-                    )
-                    camera.has_prior_focal_length = focal is not None
-                    known[key] = database.write_camera(camera)
-                image = database.write_image(pycolmap.Image(name=_number_name(i), camera_id=known[key]))
-                stored = read_npz(_features_file(work, i))
-                descriptors = pycolmap.FeatureDescriptors(
-                    pycolmap.FeatureExtractorType.SIFT, np.ascontiguousarray(stored["descriptors"])
+    with pycolmap.Database.open(path) as database:
+        there = {image.name: image.image_id for image in database.read_all_images()}
+        for i, photo in enumerate(photos):
+            focal = options.focal or photo.focal
+            key = (cameras[photo.name], photo.width, photo.height, focal, i if options.intrinsics == "per-image" else 0)
+            number = known.setdefault(key, len(known) + 1)
+            if not database.exists_camera(number):
+                guess = focal or _FOCAL_GUESS * max(photo.width, photo.height)
+                camera = pycolmap.Camera.create_from_model_name(
+                    number, options.camera_model, guess, photo.width, photo.height
                 )
-                database.write_keypoints(image, stored["keypoints"])
+                camera.has_prior_focal_length = focal is not None
+                database.write_camera(camera, use_camera_id=True)
+            image = there.get(_number_name(i))
+            if image is None:
+                image = database.write_image(pycolmap.Image(name=_number_name(i), camera_id=number))
+            if not database.exists_descriptors(image):
+                keypoints, descriptors = _features(photo, options)
+                if not database.exists_keypoints(image):
+                    database.write_keypoints(image, keypoints)
                 database.write_descriptors(image, descriptors)
+            tick("features", i + 1, len(photos))
+
+
+def _features(photo: Photo, options: MappingOptions) -> tuple[np.ndarray, pycolmap.FeatureDescriptors]:
+    """Keypoints (n, 4) [pixels] and descriptors of a photo."""
+    gray = reduced(cv2.cvtColor(photo.read(), cv2.COLOR_RGBA2GRAY), options.feature_size)
+    settings = pycolmap.FeatureExtractionOptions()
+    settings.num_threads, settings.use_gpu, settings.max_image_size = options.threads, False, max(gray.shape)
+    settings.sift.max_num_features = options.features
+    if options.thorough:
+        settings.sift.estimate_affine_shape = settings.sift.domain_size_pooling = True
+        settings.sift.peak_threshold *= _WEAKER
+    extractor = pycolmap.FeatureExtractor.create(settings, pycolmap.Device.cpu)
+    found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(gray))
+    keypoints = np.array(pycolmap.keypoints_to_matrix(found), np.float32).reshape(-1, 4)
+    keypoints[:, :2] *= np.array([photo.width / gray.shape[1], photo.height / gray.shape[0]], np.float32)
+    return keypoints, descriptors
 
 
 def _number_name(number: int) -> str:
