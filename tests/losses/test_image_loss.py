@@ -41,7 +41,7 @@ def test_ssim_gradient_equals_kornia() -> None:
 
 def test_value_is_the_papers_sum_at_its_image_size() -> None:
     prediction, target = images()
-    loss = ImageLoss()(prediction, target)
+    loss = ImageLoss(balance=0.9)(prediction, target)
     first, second = (x.movedim(-1, 2) for x in (prediction, target))
     for b in range(3):
         squared = (first[b] - second[b]).square().sum() / 2  # two views: their mean
