@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from data_prep.common.progress import Tick, bars
-from gausim.core.errors import ConfigError, GausSimError
+from gausim.core.errors import ConfigError, GausSimError, sentence
 
 T = TypeVar("T", bound="Options")
 _TYPES: dict[str, type] = {"int": int, "float": float, "Path": Path, "tuple[float,": float, "tuple[int,": int}
@@ -123,7 +123,7 @@ def run_command(
         with bars(waiting) as tick:
             text = run(arguments, tick)
     except (GausSimError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {sentence(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted. The same command goes on where it was.", file=sys.stderr)

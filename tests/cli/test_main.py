@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import errno
 import importlib.util
+import os
+import subprocess
 import sys
 import types
 
@@ -69,3 +72,49 @@ def test_defects_keep_their_traceback_and_an_interrupt_has_the_shells_status(com
         cli.main(["fake"])
     command(raising(KeyboardInterrupt()))
     assert cli.main(["fake"]) == 130
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device", "out/a.png"),
+            "out/a.png: No space left on device. Make room",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied", "/locked"), "/locked: Permission denied. Correct the perm"),
+        (OSError(errno.EROFS, "Read-only file system", "a", None, "b"), "a -> b: Read-only file system. The disk is"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), "Save the file as UTF-8"),
+        (ValueError("two\nlines"), "two lines (ValueError). GAUSIM_DEBUG=1"),
+    ],
+)
+def test_errors_of_files_and_values_are_one_line(command, capsys, error: Exception, told: str) -> None:
+    command(raising(error))
+    assert cli.main(["fake"]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: ") and told in shown and shown.count("\n") == 1
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "cp437"])
+def test_text_that_the_terminal_lacks_is_escaped(encoding: str) -> None:
+    code = "import sys; sys.modules['gausim.cli.report'] = m = type(sys)('x'); "
+    code += (
+        "m.main = lambda argv: print('a \\u2026 b \\u2013') or 0; from gausim.cli.main import main; main(['report'])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=True
+    )
+    assert done.stdout.strip() == b"a \\u2026 b \\u2013"
+
+
+def test_an_interrupt_that_lightning_makes_an_exit_has_the_shells_status(command) -> None:
+    def interrupted(argv: list[str]) -> int:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            sys.exit(1)
+
+    command(interrupted)
+    assert cli.main(["fake"]) == 130
+    command(raising(SystemExit(3)))
+    with pytest.raises(SystemExit):
+        cli.main(["fake"])

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 from gausim import __version__
-from gausim.core.errors import GausSimError
+from gausim.core.errors import sentence
 
 EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, which shells report for an interrupted program
 # Each command is a module of this package with a function `main(argv)`.
 COMMANDS = {
     "prepare": "Make a data set from films and photos, stage by stage; fetch the LPIPS weights.",
@@ -59,23 +61,34 @@ def _unknown(name: str) -> str:
 
 
 def _run(name: str, argv: list[str]) -> int:
-    """Runs a command; errors of gausim are printed in one line, other exceptions with their traceback."""
+    """Runs a command; errors that a user can act on are printed in one line, defects with their traceback."""
     try:
         return int(command(name)(argv))
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, KeyboardInterrupt):
+            raise
         if os.environ.get("GAUSIM_DEBUG", "") not in ("", "0"):
             raise
-        if isinstance(error, KeyboardInterrupt):
+        if not isinstance(error, Exception):  # Lightning makes a SystemExit of an interrupt
             print("interrupted", file=sys.stderr)
-            return 130  # 128 + SIGINT, which shells report for an interrupted program
-        if not isinstance(error, GausSimError):
+            return EXIT_INTERRUPTED
+        text = sentence(error)
+        if text is None:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {text}", file=sys.stderr)
         return EXIT_USAGE
+
+
+def _encode_anything() -> None:
+    """Lets text that the terminal's encoding lacks be written as escapes, so that no command ends by it."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; exit status: 0 done, 2 wrong usage or input, 130 interrupted, else the command's."""
+    _encode_anything()
     name, *rest = list(sys.argv[1:] if argv is None else argv) or [""]
     if name in ("-h", "--help", "help"):
         print(usage())

@@ -1,5 +1,16 @@
 """Errors that a user can act on. Every message states the expectation, the finding and a remedy."""
 
+import errno
+
+_REMEDIES = {
+    errno.ENOSPC: "Make room on the disk.",
+    errno.EDQUOT: "Make room: the quota is used up.",
+    errno.EACCES: "Correct the permissions, or choose another path.",
+    errno.EPERM: "Correct the permissions, or choose another path.",
+    errno.EROFS: "The disk is write-protected; choose another path.",
+    errno.ENAMETOOLONG: "Choose a shorter path.",
+}
+
 
 class GausSimError(Exception):
     """Base of every error that gausim raises on purpose; the command line prints it without a traceback."""
@@ -31,3 +42,26 @@ class DivergenceError(GausSimError):
 
 class FetchError(GausSimError):
     """A published run or data set cannot be fetched: unknown, unreachable, damaged, unsafe, or the disk is full."""
+
+
+def sentence(error: Exception) -> str | None:
+    """One line on an error that a user can act on; None for a defect of gausim.
+
+    Errors of the operating system name their file. Errors of encodings and of values come from libraries that read
+    the user's files; the traceback says which.
+    """
+    if isinstance(error, GausSimError):
+        return str(error)
+    if isinstance(error, OSError):
+        place = " -> ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        cause = error.strerror or str(error) or type(error).__name__
+        remedy = _REMEDIES.get(error.errno or 0, "Check the path.") if place else _REMEDIES.get(error.errno or 0, "")
+        return " ".join(f"{place + ': ' if place else ''}{cause}. {remedy}".split())
+    if isinstance(error, UnicodeError):
+        return f"text is not in the expected encoding ({error}). Save the file as UTF-8. {_TRACEBACK}"
+    if isinstance(error, ValueError):
+        return f"{' '.join(str(error).split()) or 'a value is wrong'} (ValueError). {_TRACEBACK}"
+    return None
+
+
+_TRACEBACK = "GAUSIM_DEBUG=1 in the environment shows where."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,11 +15,12 @@ T = TypeVar("T")
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parses a JSON text.
+    """Parses a JSON text, with or without a byte order mark of UTF-8.
 
     Raises:
         ValueError: the text is not JSON, or has NaN, infinity, a number beyond 64 bits or thousands of nested brackets.
     """
+    text = text.removeprefix("\ufeff") if isinstance(text, str) else text.removeprefix(codecs.BOM_UTF8)
     try:
         data = msgspec.json.decode(text)
         msgspec.msgpack.encode(data)  # msgspec reads integers of any length; MessagePack refuses those beyond 64 bits
