@@ -97,3 +97,78 @@ def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], 
     with pytest.raises(DataError, match=message) as error:
         read_transforms(path)
     assert str(path) in str(error.value)
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read_transforms(path).frames) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "found"),
+    [
+        ("a\\r.png", ["a/r.png"], "a/r.png"),
+        ("a\\r", ["a/r.jpg"], "a/r.jpg"),
+        ("./a/r", ["a/r.jpeg"], "a/r.jpeg"),
+        ("a/r.png", ["a/r.JPG"], "a/r.JPG"),
+        ("a/r.0001", ["a/r.0001.png", "a/r.0002.png"], "a/r.0001.png"),
+        ("a/r", [], "a/r.png"),
+        ("a\\r.jpg", [], "a/r.jpg"),
+    ],
+)
+def test_names_of_other_programs_find_their_image(tmp_path: Path, name: str, there: list[str], found: str) -> None:
+    (tmp_path / "a").mkdir()
+    for one in there:
+        (tmp_path / one).touch()
+    path = written(tmp_path, second={"file_path": name})
+    assert read_transforms(path).frames[1].path == tmp_path / found
+
+
+def test_a_name_that_two_images_fit_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    for one in ("a/r.png", "a/r.jpg"):
+        (tmp_path / one).touch()
+    with pytest.raises(DataError, match=r"'a/r' fits a/r.png and a/r.jpg"):
+        read_transforms(written(tmp_path, second={"file_path": "a/r"}))
+
+
+@pytest.mark.parametrize(
+    ("file", "entry", "focal"),
+    [
+        ({"camera_angle_x": 2 * math.atan(10 / 80), "camera_angle_y": 2 * math.atan(8 / 120)}, {}, (80.0, 120.0)),
+        ({"fl_x": 80.0, "camera_angle_y": 2 * math.atan(8 / 90)}, {}, (80.0, 90.0)),
+        ({"camera_angle_x": 2 * math.atan(10 / 60), "fl_y": 50.0}, {}, (60.0, 50.0)),
+        ({"fl_x": 9.0, "fl_y": 9.0}, {"camera_angle_x": 2 * math.atan(10 / 70)}, (70.0, 70.0)),
+        ({"camera_angle_x": 1.0}, {"fl_x": 30.0, "fl_y": 40.0}, (30.0, 40.0)),
+    ],
+)
+def test_focal_lengths_of_all_dialects(tmp_path: Path, file, entry, focal: tuple[float, float]) -> None:
+    changes = {"fl_x": None, "fl_y": None, "camera_angle_x": None, **file}
+    own = {"fl_x": 9.0} if "fl_x" not in file and "camera_angle_x" not in file else {}
+    path = written(tmp_path, second=entry, **changes)
+    data = json.loads(path.read_text())
+    data["frames"][0].update(own)
+    path.write_text(json.dumps(data))
+    k = read_transforms(path).cameras.Ks[1]
+    assert (float(k[0, 0]), float(k[1, 1])) == pytest.approx(focal, rel=1e-5)
+
+
+def test_the_last_row_of_a_pose_may_be_left_out(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    data = json.loads(path.read_text())
+    for entry in data["frames"]:
+        del entry["transform_matrix"][3]
+    path.write_text(json.dumps(data))
+    torch.testing.assert_close(read_transforms(path).cameras.viewmats, CAMERAS.viewmats)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [{"is_fisheye": True}, {"mask_path": "m.png"}, {"lens": "ftheta"}, {"rolling_shutter": [0, 0, 0.1]},
+     {"from_mitsuba": True}],
+)  # fmt: skip
+def test_fields_that_change_the_picture_are_refused_by_name(tmp_path: Path, field: dict[str, object]) -> None:
+    with pytest.raises(DataError, match=rf"frames\[1\]: field '{next(iter(field))}' is .*not supported"):
+        read_transforms(written(tmp_path, second=field))
+    assert read_transforms(written(tmp_path, is_fisheye=False, rolling_shutter=[0, 0, 0], applied_transform=[[1]]))

@@ -180,13 +180,22 @@ def fitted(camera: ColmapCamera, photo: Photo) -> tuple[Photo, ColmapCamera]:
 def read_lens_transforms(path: Path) -> list[Posed]:
     """The frames of a ``transforms.json``, whose lenses may be distorted (nerfstudio's models)."""
     from gausim.core import Cameras
-    from gausim.io.transforms import image_name, pinhole_of, read_entries, size_field, viewmat_of
+    from gausim.io.transforms import (
+        image_name,
+        lens_fields,
+        pinhole_of,
+        read_entries,
+        refuse_fields,
+        size_field,
+        viewmat_of,
+    )
 
     data = read_json(path)
     posed, names = [], set()
     for where, entry in read_entries(data, path):
-        fields = {**data, **entry}
-        name = image_name(entry, where)
+        fields = lens_fields(data, entry)
+        refuse_fields(fields, where, obeyed=("is_fisheye",))
+        name = image_name(entry, where, path.parent)
         if name in names:
             raise DataError(f"{where}: field 'file_path' '{name}' stands twice.")
         names.add(name)
@@ -208,7 +217,7 @@ def _lens(fields: dict[str, Any], k: np.ndarray, size: tuple[int, int], where: s
     def coefficients(*keys: str) -> list[float]:
         return [number_field(fields, key, where) if key in fields else 0.0 for key in keys]
 
-    model = fields.get("camera_model", "OPENCV")
+    model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
     head = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
     if model == "OPENCV_FISHEYE":
         params = head + coefficients("k1", "k2", "k3", "k4")

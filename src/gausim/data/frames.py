@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError
 from gausim.data.images import read_rgba_into, room_for
+from gausim.io.files import natural
 from gausim.io.packed import HEADER, is_packed, read_packed
 from gausim.io.transforms import PosedFrame, read_transforms
 
@@ -109,13 +112,16 @@ class ImageSource:
 def _frames_of_views(path: Path, frames: Sequence[PosedFrame], views: Sequence[str]) -> list[list[int]]:
     """Numbers of the entries, indexed as [view][frame]."""
     table: dict[str, dict[int, int]] = {view: {} for view in views}
+    entries: dict[str, list[int]] = {view: [] for view in views}
     for i, frame in enumerate(frames):
         if frame.camera not in table:
             raise DataError(f"{path}: frames[{i}] is of camera '{frame.camera}', dataset.json has {list(views)}.")
-        number = frame.frame if frame.frame is not None else len(table[frame.camera])
-        if number in table[frame.camera]:
-            raise DataError(f"{path}: frame {number} of camera '{frame.camera}' is listed twice.")
-        table[frame.camera][number] = i
+        entries[frame.camera].append(i)
+    for view, own in entries.items():
+        for number, i in _numbered(path, frames, view, own):
+            if number in table[view]:
+                raise DataError(f"{path}: frame {number} of camera '{view}' is listed twice.")
+            table[view][number] = i
     count = max(max(row, default=-1) for row in table.values()) + 1
     for view, row in table.items():
         if len(row) < count:
@@ -125,6 +131,43 @@ def _frames_of_views(path: Path, frames: Sequence[PosedFrame], views: Sequence[s
                 "Restore them, or take the view out of dataset.json."
             )
     return [[table[view][f] for f in range(count)] for view in views]
+
+
+def _numbered(path: Path, frames: Sequence[PosedFrame], view: str, own: list[int]) -> list[tuple[int, int]]:
+    """The entries of a camera with their frame numbers: the stated ones, else by time, else in their order.
+
+    Raises:
+        DataError: times repeat or contradict the numbers, or names were sorted as text.
+    """
+    timed = [i for i in own if frames[i].time is not None]
+    numbered = [i for i in own if frames[i].frame is not None]
+    if len(numbered) == len(own):
+        order = sorted(own, key=lambda i: frames[i].frame or 0)
+    elif numbered:
+        raise DataError(f"{path}: {len(own) - len(numbered)} entries of camera '{view}' lack 'frame'. Give it to all.")
+    else:
+        order = sorted(own, key=lambda i: frames[i].time or 0.0) if len(timed) == len(own) else own
+    if len(timed) == len(own):
+        for a, b in pairwise(order):
+            if not (frames[a].time or 0.0) < (frames[b].time or 0.0):
+                raise DataError(
+                    f"{path}: field 'time' of camera '{view}' does not grow from frames[{a}] ({frames[a].path.name}, "
+                    f"{frames[a].time:g}) to frames[{b}] ({frames[b].path.name}, {frames[b].time:g}). Correct 'time' "
+                    "or 'frame'."
+                )
+    elif not numbered:
+        _check_order(path, [frames[i].path.name for i in own], view)
+    return [(stated if (stated := frames[i].frame) is not None else n, i) for n, i in enumerate(order)]
+
+
+def _check_order(path: Path, names: Sequence[str], view: str) -> None:
+    """Raises a :class:`DataError` where entries without number or time are not in the order of their names' numbers."""
+    for a, b in pairwise(names):
+        if natural(a) > natural(b) and re.search(r"[0-9]", a + b):
+            raise DataError(
+                f"{path}: entries of camera '{view}' go from {a} to {b}, as if sorted as text. Sort them by number, or "
+                "give every entry 'frame' or 'time'."
+            )
 
 
 def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: Sequence[str]) -> None:

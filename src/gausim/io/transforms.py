@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,20 @@ from gausim.io.plain_json import read_json
 # Camera models without distortion, or with distortion that is checked to be zero.
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+# What other programs state and what becomes of it; fields of neither table are unknown to them.
+REFUSED = {
+    "is_fisheye": "Undistort the images with `gausim prepare poses`.",
+    "lens": "Export a pinhole or OpenCV lens.",
+    "rolling_shutter": "Use images of a global shutter, or set the field to 0.",
+    "from_mitsuba": "Export camera to world in OpenGL axes.",
+    "mask_path": "Write the masks into the images' alpha with `gausim prepare segment`, and delete the field.",
+}
+# They describe how other programs normalise or start; the poses stand as they are.
+LEFT_ASIDE = (
+    "aabb_scale", "scale", "offset", "up", "applied_transform", "applied_scale", "ply_file_path",
+    "orientation_override", "sharpness", "rotation", "depth_file_path", "colmap_im_id", "n_extra_learnable_dims",
+)  # fmt: skip
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".PNG", ".JPG", ".JPEG", ".TIF", ".TIFF")
 _LONGEST_NAME = 255
 _Row = tuple[float, float, float, float]
 # OpenGL cameras look along -z with y up, OpenCV cameras along +z with y down.
@@ -34,6 +49,7 @@ class PosedFrame:
     camera: str  # name of the camera; by default the image's folder
     frame: int | None  # frame number within its sequence; None for a still
     heldout: bool  # whether the entry is excluded from training
+    time: float | None = None  # moment in the file's own unit, which orders frames without a number
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +65,8 @@ class PosedImages:
 def read_transforms(path: Path) -> PosedImages:
     """Reads a ``transforms.json`` of undistorted pinhole images of one size.
 
-    Intrinsics may be global or per frame, as ``fl_x`` (``fl_y``, ``cx``, ``cy``) or ``camera_angle_x`` [radian];
-    without ``w`` and ``h`` the size of the first image is used (Blender's layout).
+    Intrinsics may be global or per frame, as ``fl_x`` (``fl_y``, ``cx``, ``cy``) or ``camera_angle_x``
+    (``camera_angle_y``) [radian]; without ``w`` and ``h`` the size of the first image is used (Blender's layout).
 
     Raises:
         DataError: the file is missing or not JSON, a field is missing, malformed or of another size, the lens distorts,
@@ -60,7 +76,8 @@ def read_transforms(path: Path) -> PosedImages:
     size: tuple[int, int] | None = None
     frames, viewmats, intrinsics = [], [], []
     for field, entry in read_entries(data, path):
-        fields = {**data, **entry}
+        fields = lens_fields(data, entry)
+        refuse_fields(fields, field)
         frames.append(_frame(path.parent, entry, field))
         here = size_field(fields, field) or size
         if here is None:
@@ -131,11 +148,29 @@ def positive_field(fields: dict[str, Any], key: str, where: str) -> float:
     return value
 
 
-def image_name(entry: dict[str, Any], field: str) -> str:
-    """File name of an entry's image, with its extension (Blender omits it).
+def lens_fields(data: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+    """The fields of the file and of an entry, which wins: its focal length replaces the file's in either form."""
+    own = {key for axis in "xy" for key in (f"fl_{axis}", f"camera_angle_{axis}") if key in entry}
+    replaced = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y") if own else ()
+    return {**{key: value for key, value in data.items() if key not in replaced}, **entry}
+
+
+def refuse_fields(fields: dict[str, Any], field: str, *, obeyed: Collection[str] = ()) -> None:
+    """Raises a :class:`DataError` that names a field of :data:`REFUSED` which is set and not ``obeyed``."""
+    for key, remedy in REFUSED.items():
+        value = fields.get(key)
+        if key in obeyed or not (any(value) if isinstance(value, list) else value):
+            continue
+        raise DataError(f"{field}: field '{key}' is {value!r:.60}, which is not supported. {remedy}")
+
+
+def image_name(entry: dict[str, Any], field: str, folder: Path) -> str:
+    """File name of an entry's image in a folder, with the extension of the file that is there.
+
+    Blender omits the extension, programs of Windows write backslashes, and images may have been converted since.
 
     Raises:
-        DataError: the entry has no file name or an invalid one.
+        DataError: the entry has no file name or an invalid one, or several images fit it.
     """
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
@@ -143,15 +178,33 @@ def image_name(entry: dict[str, Any], field: str) -> str:
     # File systems have no longer names, and querying one raises an OSError.
     if any(len(part.encode()) > _LONGEST_NAME for part in name.split("/")) or not name.isprintable():
         raise DataError(f"{field}: field 'file_path' is no name of a file: {name!r:.60}.")
-    return name if Path(name).suffix else f"{name}.png"
+    if (folder / name).is_file():
+        return name
+    name = name.replace("\\", "/")
+    if (folder / name).is_file():
+        return name
+    stem, suffix = name, ""
+    if Path(name).suffix.lower() in IMAGE_SUFFIXES:
+        suffix = Path(name).suffix
+        stem = name.removesuffix(suffix)
+    found = [stem + each for each in IMAGE_SUFFIXES if len(Path(stem).name.encode()) + len(each) <= _LONGEST_NAME
+             and (folder / (stem + each)).is_file()]  # fmt: skip
+    distinct = [one for i, one in enumerate(found)
+                if not any((folder / one).samefile(folder / other) for other in found[:i])]  # fmt: skip
+    if len(distinct) > 1:
+        raise DataError(
+            f"{field}: field 'file_path' '{name}' fits {' and '.join(distinct)}. Write the name with its extension."
+        )
+    return distinct[0] if distinct else stem + (suffix or ".png")
 
 
 def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
-    path = folder / image_name(entry, field)
+    path = folder / image_name(entry, field, folder)
     number = entry.get("frame")
     if number is not None and (not isinstance(number, int) or number < 0):
         raise DataError(f"{field}: field 'frame' must be a frame number from 0 on, got {number!r}.")
-    return PosedFrame(path, str(entry.get("camera", path.parent.name)), number, bool(entry.get("heldout", False)))
+    time = number_field(entry, "time", field) if entry.get("time") is not None else None
+    return PosedFrame(path, str(entry.get("camera", path.parent.name)), number, bool(entry.get("heldout", False)), time)
 
 
 def size_field(fields: dict[str, Any], field: str) -> tuple[int, int] | None:
@@ -171,17 +224,20 @@ def size_field(fields: dict[str, Any], field: str) -> tuple[int, int] | None:
 def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
     """World to camera (OpenCV) of an entry's ``transform_matrix``; its rotation is checked elsewhere.
 
+    The last row may be left out.
+
     Raises:
-        DataError: the field is missing, or not a finite 4 x 4 matrix with the last row of a pose.
+        DataError: the field is missing, or not a finite 3 x 4 or 4 x 4 matrix with the last row of a pose.
     """
     if "transform_matrix" not in entry:
         raise DataError(f"{field}: field 'transform_matrix' is missing (camera to world, 4 x 4, OpenGL axes).")
     wrong = f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1."
     try:
-        rows = msgspec.convert(entry["transform_matrix"], tuple[_Row, _Row, _Row, _Row])
+        rows = msgspec.convert(entry["transform_matrix"], list[_Row])
     except msgspec.ValidationError as error:
         raise DataError(wrong) from error
-    if max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+    rows += [(0.0, 0.0, 0.0, 1.0)] * (len(rows) == 3)
+    if len(rows) != 4 or not max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) <= 1e-6:
         raise DataError(wrong)
     pose = torch.tensor(rows, dtype=torch.float64) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
     # The transpose is the inverse of a rotation, and unlike a general inverse it preserves errors of the matrix for
@@ -208,21 +264,30 @@ def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Flo
     Raises:
         DataError: no focal length is given, or a number is malformed or out of range.
     """
-    if "fl_x" in fields:
-        fl_x = number_field(fields, "fl_x", field)
-    elif "camera_angle_x" in fields:
-        angle = number_field(fields, "camera_angle_x", field)
-        if not 0 < angle < math.pi:
-            degrees = f" In degrees that would be {math.radians(angle):.4g} radian." if math.pi <= angle < 180 else ""
-            raise DataError(
-                f"{field}: field 'camera_angle_x' must be between 0 and pi [radian], got {angle:g}.{degrees} Write the "
-                "horizontal field of view in radian."
-            )
-        fl_x = size[0] / (2 * math.tan(angle / 2))
-    else:
+    focal = [_focal(fields, axis, length, field) for axis, length in zip("xy", size, strict=True)]
+    fl_x = focal[0]
+    if fl_x is None:
         raise DataError(f"{field}: neither field 'fl_x' [pixels] nor 'camera_angle_x' [radian] is there.")
-    usual = {"fl_y": fl_x, "cx": size[0] / 2, "cy": size[1] / 2}
-    fl_y, cx, cy = (number_field({**usual, **fields}, key, field) for key in usual)
+    fl_y = focal[1] if focal[1] is not None else fl_x
+    usual = {"cx": size[0] / 2, "cy": size[1] / 2}
+    cx, cy = (number_field({**usual, **fields}, key, field) for key in usual)
     if fl_x <= 0 or fl_y <= 0:
         raise DataError(f"{field}: focal lengths must be positive, got fl_x {fl_x:g}, fl_y {fl_y:g}.")
     return torch.tensor([[fl_x, 0.0, cx], [0.0, fl_y, cy], [0.0, 0.0, 1.0]])
+
+
+def _focal(fields: dict[str, Any], axis: str, length: int, field: str) -> float | None:
+    """Focal length along an axis [pixels] by ``fl_x`` or ``camera_angle_x``; None where neither is there."""
+    key = f"camera_angle_{axis}"
+    if f"fl_{axis}" in fields:
+        return number_field(fields, f"fl_{axis}", field)
+    if key not in fields:
+        return None
+    angle = number_field(fields, key, field)
+    if not 0 < angle < math.pi:
+        degrees = f" In degrees that would be {math.radians(angle):.4g} radian." if math.pi <= angle < 180 else ""
+        raise DataError(
+            f"{field}: field '{key}' must be between 0 and pi [radian], got {angle:g}.{degrees} Write the field of "
+            "view in radian."
+        )
+    return length / (2 * math.tan(angle / 2))
