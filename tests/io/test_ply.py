@@ -177,3 +177,88 @@ def test_masks_given_by_path_are_used(tmp_path: Path) -> None:
     save_masks(scene, tmp_path / "mine.npz")
     assert not load_scene(tmp_path / "scene.ply").pinned.any()
     assert torch.equal(load_scene(tmp_path / "scene.ply", masks=tmp_path / "mine.npz").pinned, scene.pinned)
+
+
+def pack(parts: list[tuple[int, int]]) -> int:
+    """Integers with their bits, the first highest."""
+    value = 0
+    for part, bits in parts:
+        value = value << bits | part
+    return value
+
+
+def write_compressed(path: Path, count: int, *, sh: int = 0, colors: bool = True, chunks: int | None = None) -> None:
+    """Gaussian i of a compressed PLY: fractions i/2047, 1 and 0 of a box from -1 to 3, largest component i % 4."""
+    axes = [f"{end}_{kind}{a}" for kind in ("", "scale_") for end in ("min", "max") for a in "xyz"]
+    rgb = [f"{end}_{c}" for end in ("min", "max") for c in "rgb"] if colors else []
+    chunk = np.zeros(-(-count // 256) if chunks is None else chunks, [(n, "f4") for n in axes + rgb])
+    for n in axes:
+        chunk[n] = {"min_": -1, "max_": 3}[n[:4]] - (4 if "scale" in n else 0)
+    for n in rgb:
+        chunk[n] = {"min_": 0.2, "max_": 0.6}[n[:4]]
+    vertex = np.zeros(count, [(f"packed_{n}", "u4") for n in ("position", "rotation", "scale", "color")])
+    for i in range(count):
+        vertex["packed_position"][i] = pack([(i, 11), (1023, 10), (0, 11)])
+        vertex["packed_scale"][i] = pack([(2047, 11), (0, 10), (i, 11)])
+        vertex["packed_rotation"][i] = pack([(i % 4, 2), (1023, 10), (0, 10), (512, 10)])
+        vertex["packed_color"][i] = pack([(0, 8), (255, 8), (51, 8), (255 * (i % 2), 8)])
+    elements = [plyfile.PlyElement.describe(chunk, "chunk"), plyfile.PlyElement.describe(vertex, "vertex")]
+    if sh:
+        rest = np.zeros(count, [(f"f_rest_{n}", "u1") for n in range(sh)])
+        rest["f_rest_0"], rest["f_rest_1"] = 255, 191
+        elements.append(plyfile.PlyElement.describe(rest, "sh"))
+    plyfile.PlyData(elements, byte_order="<").write(path)
+
+
+@pytest.mark.parametrize(("count", "sh", "colors"), [(4, 0, True), (300, 9, True), (7, 45, False)])
+def test_compressed_ply_is_read(tmp_path: Path, count: int, sh: int, colors: bool) -> None:
+    write_compressed(tmp_path / "scene.compressed.ply", count, sh=sh, colors=colors)
+    scene = load_scene(tmp_path / "scene.compressed.ply")
+    fractions = 4 * torch.arange(count) / 2047
+    expected = torch.stack([fractions - 1, torch.full((count,), 3.0), torch.full((count,), -1.0)], 1)
+    torch.testing.assert_close(scene.means, expected)
+    expected = torch.stack([torch.full((count,), -1.0), torch.full((count,), -5.0), fractions - 5], 1)
+    torch.testing.assert_close(scene.log_scales, expected)
+    a, c = 0.5 * 2**0.5, (512 / 1023 - 0.5) * 2**0.5
+    turns = [[0.0, a, -a, c], [a, 0.0, -a, c], [a, -a, 0.0, c], [a, -a, c, 0.0]]
+    torch.testing.assert_close(scene.quats[:4], torch.tensor(turns))
+    rgb = torch.tensor([0.2, 0.6, 0.28] if colors else [0.0, 1.0, 0.2])
+    torch.testing.assert_close(scene.sh[0, 0] * 0.28209479177387814 + 0.5, rgb)
+    assert torch.sigmoid(scene.opacity_logits[:2]).tolist() == pytest.approx([0.5 / 255, 1 - 0.5 / 255])
+    assert scene.sh_degree == {0: 0, 9: 1, 45: 3}[sh]
+    if sh:
+        assert scene.sh[0, 1:3, 0].tolist() == pytest.approx([4.0, (191.5 / 256 - 0.5) * 8])
+
+
+def test_a_compressed_ply_without_its_chunks_is_refused(tmp_path: Path) -> None:
+    write_compressed(tmp_path / "a.ply", 300, chunks=1)
+    with pytest.raises(SceneError, match="has 1 chunks; expected 2 chunks for 300 Gaussians"):
+        load_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".ksplat", ".sog"])
+def test_other_formats_of_splats_are_refused_with_the_way_to_convert(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"a{suffix}").write_bytes(bytes(64))
+    with pytest.raises(SceneError, match=rf"is no PLY file.*splat-transform a{suffix} a\.ply"):
+        load_scene(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_flat_splats_are_named(tmp_path: Path, degree: int) -> None:
+    columns = columns_of(random_scene(degree=degree))
+    del columns["scale_2"]
+    write_ply(tmp_path / "a.ply", columns)
+    with pytest.raises(SceneError, match="2DGS"):
+        load_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(("shift", "refused"), [(5_212_345.75, True), (-500_000.5, True), (100.0, False)])
+def test_positions_that_float32_cannot_hold_are_refused(tmp_path: Path, shift: float, refused: bool) -> None:
+    columns = {n: v.astype(np.float64) for n, v in columns_of(random_scene()).items()}
+    columns["y"] = columns["y"] + shift
+    write_ply(tmp_path / "a.ply", columns, kind="f8")
+    if not refused:
+        assert load_scene(tmp_path / "a.ply").count == len(columns["x"])
+        return
+    with pytest.raises(SceneError, match="float32 has steps of .* Subtract"):
+        load_scene(tmp_path / "a.ply")

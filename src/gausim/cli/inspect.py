@@ -33,6 +33,14 @@ def main(argv: list[str]) -> int:
         raise SceneError(f"--radii {arguments.radii}: expected fractions of the diagonal in (0, 1], fine to coarse.")
     scene = _marked(load_scene(arguments.scene, masks=arguments.masks), arguments)
     _print_scene(scene)
+    if arguments.clean:
+        from gausim.core.outliers import without_outliers
+        from gausim.io.ply import save_scene
+
+        clean = without_outliers(scene)
+        save_scene(clean, arguments.clean)
+        print(f"clean      {arguments.clean}: {clean.count} of {scene.count} kernels, with their masks")
+        return 0
     hierarchy = build_hierarchy(scene, radii=arguments.radii)
     _print_hierarchy(hierarchy, arguments.radii)
     out = arguments.out or Path(f"{arguments.scene.stem}.clusters.png")
@@ -54,6 +62,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--simulate", action="append", default=[], metavar="SIDE", help="simulate only kernels on this side, e.g. "
         "\"above z=0.1\" [scene units]; draw the others without moving them (default: as stored)")  # fmt: skip
     add("--save-masks", action="store_true", help="store the masks so that every command uses them")
+    add("--clean", metavar="OUT.ply", type=Path, help="write the scene without kernels larger than the body or far "
+        "outside of it, and nothing else")  # fmt: skip
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
         help="bound the clusters' diameters per level, fine to coarse [diagonals of the simulated kernels' bounding "
         "box] (default: {:g} {:g}, as of model=gausim)".format(*DEFAULT_RADII))  # fmt: skip

@@ -6,6 +6,7 @@ needs, are in ``<stem>.masks.npz`` next to it.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,13 +21,20 @@ from plyfile import PlyData, PlyListProperty, PlyParseError
 from torch import Tensor
 
 from gausim.core.errors import DataError, SceneError
+from gausim.core.outliers import outliers
 from gausim.core.scene import GaussianScene
+from gausim.io.compressed_ply import decompressed, is_compressed
 from gausim.io.files import replacing
 from gausim.io.npz import read_npz
 
+logger = logging.getLogger(__name__)
 MASK_SUFFIX = ".masks.npz"
 MASK_NAMES = ("simulated", "pinned", "foreground")
 
+# Formats of splats that are not PLY.
+OTHER_FORMATS = (".splat", ".ksplat", ".spz", ".sog", ".rad")
+# Steps of float32 up to this fraction of the body's extent lose nothing that is visible.
+COARSEST_STEP = 1e-4
 # f_rest has (d + 1)^2 - 1 coefficients for each of three channels.
 _REST_COUNTS = (0, 9, 24, 45)
 _POSITION, _COLOR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -64,7 +72,7 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
 
     Normals and unknown properties are skipped; doubles are rounded to float32. Masks are by default those of
     ``<stem>.masks.npz`` next to the PLY; without it every kernel is simulated and foreground and none is pinned.
-    The scene's name is by default the file's stem.
+    The scene's name is by default the file's stem. Kernels that are most likely wrong are named in a warning.
 
     Raises:
         SceneError: naming the file and the property that is missing, malformed, NaN, infinite or a zero quaternion.
@@ -72,6 +80,7 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     path = Path(path)
     table = _read_vertices(path)
     rest = _rest_names(path, table.dtype.names or ())
+    _check_precision(path, table)
     values = torch.from_numpy(_columns(path, table, [*_POSITION, *_SHAPE, *_COLOR, *rest]))
     means, opacity, log_scales, quats, color, high = values.split((3, 1, 3, 4, 3, len(rest)), dim=1)
     sh = torch.cat([color[:, None], high.reshape(len(values), 3, -1).transpose(1, 2)], dim=1)
@@ -87,7 +96,12 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     side = masks_path(path) if masks is None else Path(masks)
-    return load_masks(scene, side) if masks is not None or side.is_file() else scene
+    scene = load_masks(scene, side) if masks is not None or side.is_file() else scene
+    for found in outliers(scene):
+        logger.warning(
+            "%s: %s `gausim inspect %s --clean OUT.ply` writes the scene without them.", path, found.what, path
+        )
+    return scene
 
 
 def save_scene(
@@ -162,12 +176,35 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
         )
     rest = [f"f_rest_{i}" for i in range(count)]
     missing = [n for n in (*_POSITION, *_COLOR, *_SHAPE, *rest) if n not in names]
+    if missing == ["scale_2"]:
+        raise SceneError(
+            f"{path}: property 'scale_2' is missing: these are flat splats (2DGS). Train the scene as 3DGS, e.g. with "
+            "`gausim reconstruct`."
+        )
     if missing:
         raise SceneError(
             f"{path}: property '{missing[0]}' is missing (missing in all: {', '.join(missing)}). Expected a 3DGS PLY; "
             "a plain point cloud or mesh must be reconstructed first (`gausim reconstruct`)."
         )
     return rest
+
+
+def _check_precision(path: Path, table: np.ndarray) -> None:
+    """Raises a :class:`SceneError` where float32 cannot hold the positions, as in coordinates of a country."""
+    x = structured_to_unstructured(table[list(_POSITION)], np.float64)
+    if not (np.abs(x) < np.finfo(np.float32).max).all():
+        return  # refused by name later
+    low, high = np.quantile(x, 0.01, axis=0), np.quantile(x, 0.99, axis=0)
+    far = np.abs(np.stack([low, high])).max()
+    extent = np.linalg.norm(high - low)
+    step = float(np.spacing(np.float32(far)))
+    if step > COARSEST_STEP * extent and extent > 0:
+        center = ", ".join(f"{value:.0f}" for value in np.round((low + high) / 2))
+        raise SceneError(
+            f"{path}: positions lie around ({center}), {far / extent:.3g} times the scene's extent from the origin: "
+            f"float32 has steps of {step:.2g} there. Subtract ({center}) from x, y, z and from the camera positions, "
+            "and export again."
+        )
 
 
 def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
@@ -187,11 +224,19 @@ def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def _read_vertices(path: Path) -> np.ndarray:
-    """The table of the vertices, which have to be the first element."""
+    """The table of the vertices, which have to be the first element; a compressed PLY is decompressed."""
+    if path.suffix.lower() in OTHER_FORMATS:
+        raise SceneError(
+            f"{path}: {path.suffix} is no PLY file. Open it in SuperSplat and export it as PLY, or convert it with "
+            f"`npx @playcanvas/splat-transform {path.name} {path.stem}.ply`."
+        )
     try:
-        elements = read_ply(path).elements
+        ply = read_ply(path)
     except DataError as error:
         raise SceneError(str(error)) from error
+    elements = ply.elements
+    if is_compressed(ply):
+        return decompressed(ply, str(path))
     if not elements or elements[0].name != "vertex":
         found = f"'{elements[0].name}'" if elements else "none"
         raise SceneError(f"{path}: first element must be 'vertex', got {found}. Expected a 3DGS scene.")
