@@ -145,7 +145,13 @@ def test_a_run_of_others_builds_nothing_else(node: dict, tmp_path: Path, monkeyp
     assert not Path("canary").exists()
 
 
+FILE = {"handlers": {"file": {"class": "logging.FileHandler", "filename": "canary", "mode": "w"}}}
+LINES = {"formatters": {"simple": {"format": "touch canary"}}}
+HTTP = {"handlers": {"web": {"class": "logging.handlers.HTTPHandler", "host": "localhost", "url": "/"}}}
+
+
 @pytest.mark.parametrize("part", [{"callbacks": {"callbacks": {"evil": TEXT}}}, {"job_logging": HANDLER},
+                                  {"job_logging": FILE}, {"hydra_logging": LINES}, {"job_logging": HTTP},
                                   {"job": {"env_set": {"PATH": "/evil"}}}], ids=json.dumps)  # fmt: skip
 def test_hydra_builds_nothing_else_for_itself(part: dict, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

@@ -16,6 +16,7 @@ from gausim.cli.sweeps.jobs import do_job
 from gausim.compose.build import is_pretrained, open_data, with_resolved_plan
 from gausim.compose.command import run_dir
 from gausim.compose.root import in_sweep
+from gausim.compose.targets import check_seed
 from gausim.compose.train import is_first, plain
 from gausim.compose.train import train as train_run_directory
 from gausim.core import RunError
@@ -41,6 +42,7 @@ def train(cfg: DictConfig) -> float | None:
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     """Trains into a run directory locked by this process, and evaluates the run if configured."""
+    check_seed(cfg.seed)
     with run.leaving_no_trace(Path(cfg.output_root)):
         cfg = with_resolved_plan(cfg)
         if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(plain(cfg)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -21,8 +23,11 @@ from gausim.compose.ablations import check_ablations
 from gausim.compose.config import compose
 from gausim.compose.errors import one_sentence, suggestion
 from gausim.compose.root import HYDRA_VERSION_BASE, ROOT_FILE, conf_dir, options
-from gausim.compose.targets import check_hydra
+from gausim.compose.targets import check_hydra, check_seed
 from gausim.core.errors import ConfigError, GausSimError
+
+# Values with quotes, lists, mappings and interpolations were meant as Hydra's grammar: its own message helps there.
+_QUOTES = re.compile(r"^[\[{'\"]|[$]\{|['\"]$")
 
 
 @dataclass
@@ -52,7 +57,7 @@ def run_hydra(task: Callable[[DictConfig], float | None], argv: Sequence[str]) -
     given = get_args_parser().parse_args(list(argv))
     sweep, folders = given.multirun, [Path(given.config_dir).resolve()] if given.config_dir else []
     with one_sentence(given.overrides):
-        words = with_data_directories(given.overrides, sweep=sweep, folders=folders)
+        words = quoted(with_data_directories(given.overrides, sweep=sweep, folders=folders))
         words += [f"hydra.searchpath=['file://{folder}']" for folder in folders]
         if given.cfg and sweep:
             for number, own in enumerate(jobs_of(words)):
@@ -104,7 +109,9 @@ def _check(words: Sequence[str], *, sweep: bool) -> None:
     if not jobs:
         raise ConfigError(f"{' '.join(words)}: expected at least one value of every key, so there is nothing to run.")
     for job in jobs:
-        check_hydra(compose(job, with_hydra=True).hydra)
+        composed = compose(job, with_hydra=True)
+        check_hydra(composed.hydra)
+        check_seed(composed.seed)
         check_ablations(job)
 
 
@@ -120,8 +127,9 @@ def with_data_directories(words: Sequence[str], *, sweep: bool = False, folders:
     named = any(word.startswith(("name=", "experiment=")) for word in words)
     for word in words:
         key, _, value = word.partition("=")
-        values = value.split(",")
-        if key != "data" or value in ("null", "???") or any(mark in value for mark in "[('$"):
+        whole = key == "data" and value not in known and Path(value).expanduser().is_dir()
+        values = [value] if whole else value.split(",")
+        if key != "data" or (not whole and (value in ("null", "???") or any(mark in value for mark in "[('$"))):
             found.append(word)
             continue
         paths = [Path(text).expanduser() for text in values if text not in known]
@@ -136,6 +144,38 @@ def with_data_directories(words: Sequence[str], *, sweep: bool = False, folders:
         found += ["data=object", f"data.root={roots}"] if paths else [word]
         found += ["name=sweep"] if sweep and len(values) > 1 and not named else []
     return found
+
+
+def quoted(words: Sequence[str]) -> list[str]:
+    """The overrides KEY=VALUE with values in quotes that Hydra's grammar lacks, or that are paths it would take apart.
+
+    So paths may have letters outside ASCII, spaces, brackets, commas, `#` and `=`, and begin with `~/`.
+    """
+    found, parser = [], OverridesParser.create()
+    for word in words:
+        key, sign, value = word.partition("=")
+        path = Path(value).expanduser() if value.startswith("~/") else Path(value)
+        try:
+            parsed = parser.parse_override(word)
+            other = parsed.is_sweep_override() or parsed.value() != value or value.startswith("~/")
+            replaced = bool(sign) and value[:1] not in ("'", '"', "") and other and _exists(path)
+        except HydraException:
+            replaced = bool(sign) and bool(re.fullmatch(r"[+~]{0,2}[\w./@-]+", key)) and not _QUOTES.search(value)
+        found.append(key + "='" + _escaped(str(path) if value.startswith("~/") else value) + "'" if replaced else word)
+    return found
+
+
+def _escaped(text: str) -> str:
+    """A text for single quotes of Hydra's grammar, in which only backslashes before a quote count."""
+    text = re.sub(r"(\\*)'", lambda found: found[1] * 2 + "\\'", text)
+    return re.sub(r"(\\+)$", lambda found: found[1] * 2, text)
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # too long, or with a null character
+        return False
 
 
 def jobs_of(words: Sequence[str]) -> Iterator[list[str]]:

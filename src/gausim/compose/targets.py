@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gausim.core.errors import ConfigError
@@ -42,8 +43,7 @@ REFUSED_MODULES = (
 )
 # Allowed in the node `hydra`: launchers, sweepers and callbacks.
 HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim")
-_LOGGING_CLASS = re.compile(r"(logging|logging\.handlers|colorlog)\.[A-Z]\w*")
-_STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
+MOST_SEED = 2**32 - 1
 
 
 def check_targets(node: DictConfig | ListConfig) -> None:
@@ -77,7 +77,7 @@ def target_faults(config: Any, root: str = "") -> Iterator[str]:
 def check_hydra(node: DictConfig) -> None:
     """Refuses a node `hydra` that would make Hydra call other code before the configuration is checked.
 
-    Launcher, sweeper and callbacks must belong to Hydra, its plugins or gausim, logging to the module logging, and
+    Launcher, sweeper and callbacks must belong to Hydra, its plugins or gausim. Logging must be Hydra's own, and
     environment variables may not be set, because they can change which programs are started.
 
     Raises:
@@ -93,12 +93,22 @@ def check_hydra(node: DictConfig) -> None:
             "shell instead."
         )
     for name in ("hydra_logging", "job_logging"):
-        for key, text in _nodes(content[name], f"hydra.{name}"):
-            # No factories, only classes of logging, and no objects except the standard streams.
-            names_code = key.endswith((".()", ".class")) and not _LOGGING_CLASS.fullmatch(str(text))
-            protocol = isinstance(text, str) and text.startswith("ext://") and text not in _STREAMS
-            if names_code or protocol:
-                raise ConfigError(f"{key}: expected a class of logging, or {' or '.join(_STREAMS)}, got {text!r}.")
+        folder = Path(hydra.__file__).parent / "conf" / "hydra" / name
+        if content[name] not in [yaml.safe_load(path.read_text()) for path in sorted(folder.glob("*.yaml"))]:
+            raise ConfigError(
+                f"hydra.{name}: states logging of its own, which could write to any file. Leave it out; hydra/{name} "
+                f"may be one of {', '.join(sorted(path.stem for path in folder.glob('*.yaml')))}."
+            )
+
+
+def check_seed(seed: Any) -> None:
+    """Refuses a seed that the generators do not take.
+
+    Raises:
+        ConfigError: it is no whole number from 0 to 4294967295.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MOST_SEED:
+        raise ConfigError(f"seed: expected a whole number from 0 to {MOST_SEED}, got {seed}.")
 
 
 def _nodes(value: Any, key: str) -> Iterator[tuple[str, Any]]:

@@ -17,6 +17,7 @@ from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.core.scene import LAWS
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_stills
 from gausim.data.surroundings import gripped, read_surroundings
+from gausim.io.files import safe_name
 from gausim.io.npz import read_array
 from gausim.io.plain_json import checked, read_json
 from gausim.io.ply import MASK_NAMES, load_scene
@@ -130,7 +131,9 @@ class ObjectData:
         path = self.root / "dataset.json"
         self.facts = read_json(path)
         found = checked(self.facts, _Facts, str(path), "Correct the field.")
-        self.name, self.fps = found.name or self.root.name, found.fps
+        self.name, self.fps = safe_name(found.name, f"{path}: field 'name'") or self.root.name, found.fps
+        for view in found.views:
+            safe_name(view, f"{path}: field 'views'")
         self.views, self.train_views, self.heldout_views = found.views, found.train_views, found.heldout_views
         self.train_frames, self.pinned_below_z = range(*found.train_frames), found.pinned_below_z
         self.surroundings, self._grip = read_surroundings(self.facts, str(path))
@@ -164,6 +167,7 @@ class ObjectData:
 
     def record(self, name: str) -> SequenceRecord:
         """A new record of a sequence, which is freed with all that it has decoded."""
+        safe_name(name, f"{self.root}: sequence")
         limit = self.train_frames.stop if self.sealed and name in self.test_part else None
         return SequenceRecord(self.root / "sequences" / name, views=self.views, fps=self.fps, limit=limit)
 

@@ -13,6 +13,10 @@ from typing import Any
 
 import yaml
 
+from gausim.core.errors import DataError
+
+# Bounds of YAML files: bytes, and values when aliases are written out. A configuration has a hundredth of it.
+_MOST_YAML, _MOST_VALUES, _LONGEST = 1 << 22, 100_000, 200
 _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 
 
@@ -68,12 +72,44 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ValueError: the file is missing, not YAML or not a mapping.
     """
     try:
+        if path.stat().st_size > _MOST_YAML:
+            raise yaml.YAMLError(f"has {path.stat().st_size} bytes, more than {_MOST_YAML}")
         loaded = yaml.safe_load(path.read_text())
+        _expanded(loaded, {})
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"{path}: cannot be read as YAML ({error}).") from error
     if not isinstance(loaded, dict):
         raise ValueError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
     return loaded
+
+
+def _expanded(value: Any, known: dict[int, int]) -> int:
+    """Number of values when aliases are written out.
+
+    Raises:
+        yaml.YAMLError: there are too many, or an alias contains itself.
+    """
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in known:
+        known[id(value)] = _MOST_VALUES + 1  # until it is known, which only a cycle meets
+        children = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1 + sum(_expanded(child, known) for child in children)
+    if known[id(value)] > _MOST_VALUES:
+        raise yaml.YAMLError(f"has more than {_MOST_VALUES} values when its aliases are written out")
+    return known[id(value)]
+
+
+def safe_name(name: str, where: str) -> str:
+    """A name that becomes part of a path below a folder, unchanged.
+
+    Raises:
+        DataError: a path made of it would leave the folder, or no file system has it.
+    """
+    parts = name.replace("\\", "/").split("/")
+    if name and (not name.isprintable() or "" in parts or ".." in parts or ":" in parts[0] or len(name) > _LONGEST):
+        raise DataError(f"{where}: {name!r:.80} is a path, not a name. Use letters, digits, '-' and '_'.")
+    return name
 
 
 def sha256(path: Path) -> str:

@@ -6,9 +6,10 @@ import csv
 import io
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -162,13 +163,22 @@ def csv_numbers(study: Study) -> str:
         if key not in sources:
             sources[key] = _sources(study.sources(*key), entry.object)
         own = {name: getattr(entry, name) for name in CSV_HEAD[:9]}
-        writer.writerow({**own, "unit": study.results.metrics[entry.metric].unit, **sources[key]})
+        unit = study.results.metrics[entry.metric].unit
+        writer.writerow(spreadsheet_cells({**own, "unit": unit, **sources[key]}))
     for group in study.groups:
         for name in group.objects:
             if not group.entries(name):
                 status = {"row": group.label, "kind": "method", "object": name, "status": group.state(name, "")}
-                writer.writerow({**status, **_sources(group.of(name), name)})
+                writer.writerow(spreadsheet_cells({**status, **_sources(group.of(name), name)}))
     return stream.getvalue()
+
+
+def spreadsheet_cells(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row whose texts no spreadsheet takes for a formula: those that begin like one follow an apostrophe."""
+    return {
+        key: f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
+        for key, value in row.items()
+    }
 
 
 def _sources(runs: Sequence[RunRecord], name: str) -> dict[str, str]:
