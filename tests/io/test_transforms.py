@@ -11,7 +11,7 @@ import torch
 from helpers.blob import ring_of_cameras
 
 from gausim.core import DataError
-from gausim.io.transforms import read_transforms, write_transforms
+from gausim.io.transforms import DISTORTION, LEFT_ASIDE, REFUSED, read_transforms, write_transforms
 
 CAMERAS = ring_of_cameras(("a/0.png", "a/1.png"), width=20, height=16)
 CAMERAS.viewmats[:, :3, 3] += torch.tensor([[0.1, 0.2, -1.0], [-0.4, 0.3, -1.5]])
@@ -172,3 +172,19 @@ def test_fields_that_change_the_picture_are_refused_by_name(tmp_path: Path, fiel
     with pytest.raises(DataError, match=rf"frames\[1\]: field '{next(iter(field))}' is .*not supported"):
         read_transforms(written(tmp_path, second=field))
     assert read_transforms(written(tmp_path, is_fisheye=False, rolling_shutter=[0, 0, 0], applied_transform=[[1]]))
+
+
+@pytest.mark.parametrize("field", LEFT_ASIDE)
+def test_fields_of_no_effect_change_nothing(tmp_path: Path, field: str) -> None:
+    posed = read_transforms(written(tmp_path, **{field: [[0.0, 1.0, 0.0, 3.0]]}))
+    torch.testing.assert_close(posed.cameras.viewmats, CAMERAS.viewmats)
+    torch.testing.assert_close(posed.cameras.Ks, CAMERAS.Ks)
+
+
+def test_the_reference_lists_every_field() -> None:
+    page = (Path(__file__).parents[2] / "docs/reference/files.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    for field in (*REFUSED, *(f for f in DISTORTION if f[0] == "p")):
+        assert any(f"`{field}`" in row and "refused" in row for row in rows), field
+    for field in LEFT_ASIDE:
+        assert any(f"`{field}`" in row and "left aside" in row for row in rows), field

@@ -13,6 +13,7 @@ from gausim import __version__
 from gausim.core.errors import sentence
 
 EXIT_USAGE = 2
+EXIT_PIPE = 141  # 128 + SIGPIPE
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, which shells report for an interrupted program
 # Each command is a module of this package with a function `main(argv)`.
 COMMANDS = {
@@ -72,6 +73,9 @@ def _run(name: str, argv: list[str]) -> int:
         if not isinstance(error, Exception):  # Lightning makes a SystemExit of an interrupt
             print("interrupted", file=sys.stderr)
             return EXIT_INTERRUPTED
+        if isinstance(error, BrokenPipeError):  # the reader, such as `head`, has seen enough
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the interpreter flushes it at its end
+            return EXIT_PIPE
         text = sentence(error)
         if text is None:
             raise

@@ -1,7 +1,10 @@
 """Errors that a user can act on. Every message states the expectation, the finding and a remedy."""
 
 import errno
+import re
 
+# Names that gausim.io.files.replacing makes.
+_TEMPORARY = re.compile(r"(?<![^/\\])\.([^/\\]+)\.[0-9]+\.tmp(?:\.\w+)?$")
 _REMEDIES = {
     errno.ENOSPC: "Make room on the disk.",
     errno.EDQUOT: "Make room: the quota is used up.",
@@ -53,7 +56,9 @@ def sentence(error: Exception) -> str | None:
     if isinstance(error, GausSimError):
         return str(error)
     if isinstance(error, OSError):
-        place = " -> ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        named = (error.filename, error.filename2)
+        # A temporary file stands for the file whose name it takes at last.
+        place = " -> ".join(_TEMPORARY.sub(r"\1", str(name)) for name in named if name is not None)
         cause = error.strerror or str(error) or type(error).__name__
         remedy = _REMEDIES.get(error.errno or 0, "Check the path.") if place else _REMEDIES.get(error.errno or 0, "")
         return " ".join(f"{place + ': ' if place else ''}{cause}. {remedy}".split())
