@@ -28,7 +28,7 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pushed: Path, tmp_path: Path) -> None:
     out = tmp_path / "adapted"
     asked = [str(joint), "--data", str(pushed), "--sequences", "hard", "other_way", "--frames", "4"]
-    assert adapt.main([*asked, "--out", str(out), "--epochs", "12"]) == 0
+    assert adapt.main([*asked, "--out", str(out), "--epochs", "24"]) == 0
     found, source = weights(out), load_run(joint).module.model.state_dict()
     own = {name.removeprefix("model."): value for name, value in found.items() if name.startswith("model.")}
     second = ("log_density.1", "attributes.1")
@@ -40,7 +40,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pu
     assert [r.name for r in run.objects[0].sequences] == ["hard", "other_way"]
     assert run.config["plan"]["t_max"] == 3 and run.config["name"].endswith("_adapted_4")
     ratios = [float(row["ratio_static"]) for row in rows(out / "epochs.csv")]
-    assert ratios[-1] < 0.93 * ratios[0]
+    assert ratios[-1] < 0.9 * ratios[0]
     told = load_results(out / "evaluation" / "metrics.json").table
     assert next(e.value for e in told if (e.row, e.split, e.metric) == ("gausim", "seen", "l2")) > 0
     videos = ["--out", str(tmp_path / "videos"), "--frames", "2", "--cameras", "cam_0"]
