@@ -152,6 +152,7 @@ HTTP = {"handlers": {"web": {"class": "logging.handlers.HTTPHandler", "host": "l
 
 @pytest.mark.parametrize("part", [{"callbacks": {"callbacks": {"evil": TEXT}}}, {"job_logging": HANDLER},
                                   {"job_logging": FILE}, {"hydra_logging": LINES}, {"job_logging": HTTP},
+                                  {"job": {"name": "../canary"}},
                                   {"job": {"env_set": {"PATH": "/evil"}}}], ids=json.dumps)  # fmt: skip
 def test_hydra_builds_nothing_else_for_itself(part: dict, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)

@@ -92,6 +92,8 @@ def check_hydra(node: DictConfig) -> None:
             f"hydra.job.env_set: expected nothing, got {content['job']['env_set']}. Set environment variables in the "
             "shell instead."
         )
+    if set("/\\$") & set(str(content["job"]["name"])):  # its log would leave the run
+        raise ConfigError(f"hydra.job.name: expected a name, got {content['job']['name']!r}.")
     for name in ("hydra_logging", "job_logging"):
         folder = Path(hydra.__file__).parent / "conf" / "hydra" / name
         if content[name] not in [yaml.safe_load(path.read_text()) for path in sorted(folder.glob("*.yaml"))]:
