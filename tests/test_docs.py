@@ -77,7 +77,9 @@ def test_training_commands_of_the_pages_compose() -> None:
     from gausim.compose.root import options
 
     known = options("data")
-    for _, (name, *words) in _commands():
+    for page, (name, *words) in _commands():
+        if page == "docs/results.md":  # its commands are those of the commit that each record names
+            continue
         if name == "train" and words and not {"--config-dir", "--shell-completion"} & set(words):
             asked = [word for word in words if word not in ("-m", "--cfg", "job")]
             asked = ["data=object" if w.startswith("data=") and w[5:] not in known else w for w in asked]
