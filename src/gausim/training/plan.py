@@ -36,7 +36,7 @@ class WarmStart:
             which starts near the solution.
     """
 
-    updates: int = 900
+    updates: int = 300
     growing: ClassVar[float] = 0.25
     decay: ClassVar[float] = 0.05
     sequences: ClassVar[int] = 12

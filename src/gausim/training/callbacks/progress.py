@@ -84,7 +84,7 @@ class EpochSummary(Callback):
         # Epochs of a fit's stages differ in length.
         left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
         if left is not None:
-            parts.append(f"about {left:.0f} min left")
+            parts.append(f"about {max(0.0, left):.0f} min left")
         return "  ".join(parts)
 
     def _table(self, trainer: Trainer) -> Table:
