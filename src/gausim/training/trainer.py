@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,6 +67,8 @@ def make_trainer(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
+    # Its notes on devices, and on services to log in to, would stand between those of the run; warnings stay.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     return Trainer(
         max_epochs=epochs,
         accelerator=settings.accelerator,
