@@ -81,7 +81,7 @@ def test_a_yaml_that_contains_itself_or_is_huge_is_refused_and_common_aliases_ar
 @pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)"])
 def test_a_name_is_no_formula(text: str) -> None:
     assert spreadsheet_cells({"object": text, "value": -1.0}) == {"object": f"'{text}", "value": -1.0}
-    assert spreadsheet_cells({"object": "bunny"}) == {"object": "bunny"}
+    assert spreadsheet_cells({"object": "bunny", "split": "+10"}) == {"object": "bunny", "split": "+10"}
 
 
 @pytest.mark.parametrize("choice", ["default", "none", "disabled", "stdout"])

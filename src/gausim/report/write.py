@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -174,11 +175,15 @@ def csv_numbers(study: Study) -> str:
 
 
 def spreadsheet_cells(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row whose texts no spreadsheet takes for a formula: those that begin like one follow an apostrophe."""
-    return {
-        key: f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
-        for key, value in row.items()
-    }
+    """A row whose texts no spreadsheet takes for a formula: those that begin like one follow an apostrophe.
+
+    Numbers with a sign, such as the frames ahead ``+10``, stay as they are.
+    """
+    return {key: f"'{value}" if isinstance(value, str) and _is_formula(value) else value for key, value in row.items()}
+
+
+def _is_formula(text: str) -> bool:
+    return text.startswith(("=", "+", "-", "@", "\t", "\r")) and re.fullmatch(r"[+-]\d+(\.\d+)?", text) is None
 
 
 def _sources(runs: Sequence[RunRecord], name: str) -> dict[str, str]:
