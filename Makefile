@@ -87,7 +87,7 @@ benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at ti
 	$(BIN)/python -m benchmarks $(or $(ARGS),all --quick)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, and a page about it
-	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=6
+	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=2
 	$(BIN)/gausim evaluate outputs/demo/seed_0
 	$(BIN)/gausim report outputs/demo/seed_0
 
