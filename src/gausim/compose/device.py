@@ -8,8 +8,6 @@ import torch
 
 from gausim.core import ConfigError
 
-DEVICES = "auto|cpu|cuda[:N]"
-
 
 def find_device(text: str = "auto") -> torch.device:
     """Reads ``auto`` (the GPU where there is one, else the CPU), ``cpu``, ``cuda`` or ``cuda:N``.
