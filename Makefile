@@ -12,6 +12,7 @@ STAMP := $(VENV)/.installed
 # Two test processes with one thread each suit a small machine; more cores: make test WORKERS=8.
 WORKERS ?= 2
 DATA ?= data/synthetic
+DEMO_DATA := data/demo
 RUN ?= outputs/demo/seed_0
 # What a report is about: runs, sweeps, or folders of them.
 DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
@@ -86,10 +87,14 @@ report: install ## Tables, figures and videos: make report DIRS="outputs/a outpu
 benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at tiny sizes, to see that it works)
 	$(BIN)/python -m benchmarks $(or $(ARGS),all --quick)
 
-demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, and a page about it
-	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=2
+demo: $(DEMO_DATA)/.made ## From nothing to a simulator that predicts: install, make an object, train, evaluate, and a page about it
+	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=1
 	$(BIN)/gausim evaluate outputs/demo/seed_0
 	$(BIN)/gausim report outputs/demo/seed_0
+
+$(DEMO_DATA)/.made: | install
+	$(BIN)/gausim prepare synthesize --objects gerbera --sequences 4 --kernels 12000 --resolution 256 --out $(DEMO_DATA)
+	touch $@
 
 clean: ## Remove caches and builds (not .venv, data or outputs)
 	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,7 +1,7 @@
 """Makes the embedded synthetic data set: elastic puddings and flowers, filmed by several cameras.
 
 Bodies move by MuJoCo's finite elements (none of gausim's own models), carry Gaussians in their cells, and are
-photographed by the reference renderer. Everything follows from the settings and the seed; a set that is already there
+photographed by the compiled renderer. Everything follows from the settings and the seed; a set that is already there
 with the same settings is left alone.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from data_prep.synthetic.writer import SyntheticObject
 
 # Raise when the same settings give another set than before.
-REVISION = 2
+REVISION = 3
 PACKAGES = ("mujoco", "numpy", "scipy", "torch", "opencv-python-headless")
 
 

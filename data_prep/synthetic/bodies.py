@@ -103,6 +103,70 @@ def flower() -> Body:
     return _body(cells, shape, held_layers=2)
 
 
+# The potted flower: column of its stem, cells across its disc and along a petal, and the layer of its blossom.
+STEM, DISC, PETAL, TOP = 2, 5, 3, 8
+
+
+def potted() -> Body:
+    """A flower with twelve separate petals and two leaves in a pot, 1.5 high; the pot is held."""
+    cells = [(i, j, k) for i in range(1, 4) for j in range(1, 4) for k in range(2)]  # the pot
+    cells += [(STEM, STEM, k) for k in range(2, TOP)]
+    cells += [(STEM + s, STEM, k) for s, k in ((1, 4), (2, 4), (-1, 5), (-2, 5))]  # the leaves
+    cells += [(i, j, TOP) for i in range(DISC) for j in range(DISC)]
+    ends = [(i, j) for i in (0, 2, 4) for out in range(1, PETAL + 1) for j in (-out, DISC - 1 + out)]
+    cells += [(i, j, TOP) for i, j in ends] + [(j, i, TOP) for i, j in ends]
+
+    def shape(grid: Array) -> Array:
+        k = grid[:, 2]
+        rest = np.where((k <= 2)[:, None], _pot(grid), _stem_and_leaves(grid))
+        rest[k >= TOP] = _blossom(grid[k >= TOP])
+        return rest
+
+    return _body(cells, shape, held_layers=3)
+
+
+def _pot(grid: Array) -> Array:
+    u, v = np.clip((grid[:, :2] - 2.5) / 1.5, -1, 1).T
+    x, y = _round_square(u, v, 1.0)
+    radius = 0.17 + 0.03 * grid[:, 2]
+    return np.stack((radius * x, radius * y, 0.15 * grid[:, 2]), 1)
+
+
+def _stem_and_leaves(grid: Array) -> Array:
+    aside, across = grid[:, 0] - 2.5, grid[:, 1] - 2.5
+    height = (grid[:, 2] - 2) / (TOP - 2)
+    wide = 0.12 - 0.035 * height
+    out = np.maximum(np.abs(aside) - 0.5, 0.0)  # how far along a leaf
+    x = 0.09 * np.sin(2.4 * height) + wide * np.clip(aside, -0.5, 0.5) + np.sign(aside) * 0.14 * out
+    y = across * np.where(out > 0, 0.15 - 0.045 * (out - 1) ** 2, wide)
+    z = 0.3 + 0.9 * height
+    centre = 0.3 + 0.9 * np.where(aside > 0, 2.5, 3.5) / (TOP - 2)
+    leaf = centre + (z - centre) * (1 - 0.32 * out) + 0.1 * out - 0.02 * out**2
+    return np.stack((x, y, np.where(out > 0, leaf, z)), 1)
+
+
+def _blossom(grid: Array) -> Array:
+    half, tilt = DISC / 2, 0.75
+    u, v = (grid[:, :2] - half).T / half
+    out = np.maximum(np.maximum(np.abs(u), np.abs(v)) - 1, 0.0) * half  # layers of cells beyond the disc
+    x, y = _round_square(np.clip(u, -1, 1), np.clip(v, -1, 1), 1.0)
+    # Petals stand in columns of a side, at [-1, -0.6], [-0.2, 0.2] and [0.6, 1], and point 30 degrees apart.
+    along_x = np.abs(u) > np.abs(v)
+    side, turn = np.where(along_x, v, u), np.where(along_x, np.sign(u), -np.sign(v))
+    column = np.clip(np.round(side / 0.8), -1, 1)
+    ahead = np.arctan2(np.where(along_x, 0.0, np.sign(v)), np.where(along_x, np.sign(u), 0.0))
+    angle, length = ahead + turn * column * np.pi / 6, out / PETAL
+    width = 0.034 + 0.05 * np.sin(np.pi * np.minimum(0.12 + 0.72 * length, 1.0)) * (1 - 0.75 * length**4)
+    across, radius = np.clip((side - 0.8 * column) / 0.2, -1, 1) * turn * width, 0.13 + 0.27 * length
+    beyond = out > 0
+    bx = np.where(beyond, radius * np.cos(angle) - across * np.sin(angle), 0.13 * x)
+    by = np.where(beyond, radius * np.sin(angle) + across * np.cos(angle), 0.13 * y)
+    rise = np.maximum(np.hypot(bx, by) - 0.1, 0)
+    bz = (grid[:, 2] - TOP) * np.where(beyond, 0.055 - 0.02 * length, 0.09) + 0.55 * rise - 0.8 * rise**2
+    x = 0.09 * np.sin(2.4) + bx * np.cos(tilt) + bz * np.sin(tilt)
+    return np.stack((x, by, 1.2 + bz * np.cos(tilt) - bx * np.sin(tilt)), 1)
+
+
 def jelly() -> Body:
     """A lopsided block with rounded sides, 1 wide and 0.8 high, its lowest point 0.45 above z = 0; nothing is held."""
     count = 5
@@ -135,7 +199,9 @@ def bar() -> Body:
     return replace(whole, held=np.abs(whole.nodes[:, 0]) > 0.8 * (1 - 4 / length) - 1e-6)
 
 
-BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower, "jelly": jelly, "bar": bar}
+BODIES: dict[str, Callable[[], Body]] = {
+    "pudding": pudding, "flower": flower, "potted": potted, "jelly": jelly, "bar": bar,
+}  # fmt: skip
 
 
 def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:

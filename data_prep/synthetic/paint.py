@@ -44,6 +44,49 @@ def _flower(x: Array, grid: Ints) -> Array:
     return color
 
 
+def _potted(x: Array, grid: Ints) -> Array:
+    """A terracotta pot with a painted band, striped stem, veined leaves and petals, and a heart of seeds."""
+    i, j, k = grid.T
+    top = k.max()
+    along = np.maximum(np.abs(i - 2), np.abs(j - 2)) - 2  # cells beyond the disc
+    color = (
+        np.array([0.36, 0.62, 0.25]) * (0.8 + 0.2 * np.sin(90 * x[:, 2] + 12 * np.arctan2(x[:, 1], x[:, 0])))[:, None]
+    )
+
+    leaf = (k < top) & (k >= 2) & (i != 2)
+    vein = np.cos(55 * np.abs(x[:, 1]) - 60 * np.abs(x[:, 0])) > 0.75
+    ribs = vein | (np.abs(x[:, 1]) < 0.006)
+    color[leaf] = np.where(ribs[:, None], [0.55, 0.75, 0.38], [0.13, 0.42, 0.2])[leaf]
+
+    pot = k < 2
+    angle, height = np.arctan2(x[:, 1], x[:, 0]), x[:, 2]
+    zigzag = np.abs(height - 0.16 - 0.03 * (2 / np.pi) * np.arcsin(np.sin(9 * angle))) < 0.014
+    bands = (np.abs(height - 0.085) < 0.008) | (np.abs(height - 0.235) < 0.008)
+    dots = ((np.mod(9 * angle / np.pi, 1) - 0.5) ** 2 + ((height - 0.262) / 0.03) ** 2) < 0.1
+    glaze = np.select([zigzag, bands, dots], [0, 1, 2], 3)
+    color[pot] = np.array([[0.95, 0.9, 0.78], [0.16, 0.34, 0.5], [0.95, 0.9, 0.78], [0.74, 0.36, 0.22]])[glaze][pot]
+    soil = pot & (height > 0.2999)
+    grain = 0.5 + 0.5 * np.sin(190 * x[:, 0]) * np.sin(170 * x[:, 1])
+    color[soil] = (np.array([0.2, 0.13, 0.09]) + 0.12 * grain[:, None])[soil]
+
+    blossom = k == top
+    centre = x[blossom & (along <= 0)].mean(0)
+    flat = (x - centre)[:, :2] * [1 / np.cos(0.75), 1.0]
+    radius, angle = np.hypot(*flat.T), np.arctan2(flat[:, 1], flat[:, 0])
+    fine = 0.5 + 0.5 * np.cos(12 * 7 * angle)
+    shade = np.clip((radius - 0.12) / 0.27, 0, 1)[:, None]
+    petal = (
+        (1 - shade) * [0.72, 0.08, 0.3] + shade * [0.98, 0.62, 0.68] - 0.13 * (fine * (1 - 0.6 * shade[:, 0]))[:, None]
+    )
+    color[blossom] = petal[blossom]
+    heart = blossom & (along <= 0)
+    seeds = np.cos(13 * angle - 130 * radius) * np.cos(13 * angle + 130 * radius)
+    rim = np.clip((radius - 0.07) / 0.04, 0, 1)[:, None]
+    seed = (1 - rim) * [0.36, 0.2, 0.07] + rim * [0.96, 0.7, 0.12]
+    color[heart] = (seed * (0.8 + 0.35 * (seeds > 0.1))[:, None])[heart]
+    return color
+
+
 def _jelly(x: Array, grid: Ints) -> Array:
     """Raspberry on one side, mint on the other, with fruits."""
     side = (x - x.min(0)) / np.ptp(x, axis=0) @ np.array([0.5, 0.2, 0.3])
@@ -60,6 +103,6 @@ def _bar(x: Array, grid: Ints) -> Array:
 
 # Of each body its colours, and how many dabs of random colours it has, of which radius [scene units].
 PAINTERS: dict[str, tuple[Callable[[Array, Ints], Array], int, float]] = {
-    "pudding": (_pudding, 26, 0.075), "flower": (_flower, 22, 0.06), "jelly": (_jelly, 60, 0.1),
-    "bar": (_bar, 40, 0.055),
+    "pudding": (_pudding, 26, 0.075), "flower": (_flower, 22, 0.06), "potted": (_potted, 0, 1.0),
+    "jelly": (_jelly, 60, 0.1), "bar": (_bar, 40, 0.055),
 }  # fmt: skip

@@ -71,6 +71,11 @@ RECIPES = {
         swing=LARGE_SWING,
     ),
     "flower_swing": replace(SOFT_FLOWER, swing=LARGE_SWING),
+    # Fine detail, and swings that one sees: the object of the demo.
+    "gerbera": Recipe(
+        "potted", Material(young_modulus=3.6e5, poisson_ratio=0.35, drag=0.65), 1e-4, swing=(0.12, 0.2),
+        room=((0.07, 0.0, 0.8), 0.86),
+    ),
     # Lands at about frame 10 and touches the floor for 4 to 5 frames.
     "jelly_fall": Recipe(
         "jelly", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.0), 2e-4, viscosity=0.0015,

@@ -1,4 +1,4 @@
-"""Cameras around an object, and images of its states by the reference renderer."""
+"""Cameras around an object, and images of its states by the compiled renderer."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 from data_prep.common.spread import dome
 from data_prep.synthetic.bodies import Array
 from gausim.core import Cameras, GaussianScene
+from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw, to_bytes
-from gausim.render.reference import ReferenceRenderer
 
 FIELD_OF_VIEW = math.radians(40.0)
 MARGIN = 1.0  # the sphere around the bounding box overstates the object; what is left is room for its motion
@@ -63,7 +63,7 @@ def photograph(
     u, _, vt = np.linalg.svd(gradients)
     with torch.inference_mode():
         means, deformed, turned = (torch.from_numpy(part).float() for part in (positions, gradients, u @ vt))
-        drawn = draw(ReferenceRenderer(), scene, means, deformed, turned, torch.arange(scene.count), cameras)
+        drawn = draw(CpuRenderer(), scene, means, deformed, turned, torch.arange(scene.count), cameras)
         alpha = drawn.alpha.clamp(0, 1)[..., None]
         rgb = torch.where(alpha > 0.5 / 255, drawn.rgb / alpha.clamp_min(0.5 / 255), 0.0)
         return to_bytes(torch.cat((rgb, alpha), -1))

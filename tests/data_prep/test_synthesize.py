@@ -27,7 +27,7 @@ from gausim.render.reference import ReferenceRenderer
 from gausim.training.plan import TrainingPlan
 
 TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
-PUSHED = ("flower", "pudding")
+PUSHED = ("flower", "potted", "pudding")
 
 
 @pytest.fixture(scope="module")
