@@ -49,10 +49,10 @@ def test_the_options_of_a_scene_are_refused_with_a_run(command: str, tmp_path: P
 def test_all_that_a_renderer_gets_is_on_the_device_of_the_motion() -> None:
     seen: list[torch.Tensor] = []
 
-    def renderer(*inputs, background=None, depth=False) -> Rendered:
+    def renderer(*inputs, background=None) -> Rendered:
         seen.extend(x for x in (*inputs, background) if isinstance(x, torch.Tensor))
         (width, height), views = inputs[6], inputs[4].shape[:2]
-        return Rendered(inputs[0].new_zeros(*views, height, width, 3), inputs[0].new_zeros(*views, height, width), None)
+        return Rendered(inputs[0].new_zeros(*views, height, width, 3), inputs[0].new_zeros(*views, height, width))
 
     scene = random_scene(12, 1)
     cameras, turned = orbit_cameras(scene.means, azimuths=[0.0], size=(8, 6)), torch.eye(3).expand(2, 1, 3, 3)

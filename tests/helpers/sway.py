@@ -98,7 +98,7 @@ def sway_module(objective: Objective | None = None, **settings: float) -> GausSi
 
 
 def blobs(means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
-          size: tuple[int, int], *, background: Tensor | None = None, depth: bool = False) -> Rendered:  # fmt: skip
+          size: tuple[int, int], *, background: Tensor | None = None) -> Rendered:  # fmt: skip
     """A renderer of a few operations that never reads a number: the sum of Gaussians of a fixed width."""
     camera = torch.einsum("bvij,bkj->bvki", viewmats[..., :3, :3], means) + viewmats[..., None, :3, 3]
     pixel = torch.einsum("bvij,bvkj->bvki", Ks, camera)

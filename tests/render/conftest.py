@@ -27,7 +27,6 @@ class Inputs:
     Ks: Tensor
     size: tuple[int, int]
     background: Tensor
-    depth: bool = False
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
@@ -39,15 +38,14 @@ class Inputs:
 
     def draw(self, renderer: Renderer) -> Rendered:
         given = *self.tensors[:4], self.viewmats, self.Ks, self.size
-        return renderer(*given, background=self.background, depth=self.depth)
+        return renderer(*given, background=self.background)
 
     def draw_with_gradients(self, renderer: Renderer) -> tuple[Rendered, list[Tensor]]:
         """Images and the gradients of a fixed random function of them."""
         leaves = [x.requires_grad_() for x in self.tensors]
         images = self.draw(renderer)
         g = torch.Generator().manual_seed(5)
-        planes = [x for x in (images.rgb, images.alpha, images.depth) if x is not None]
-        loss = sum((x * torch.randn(x.shape, generator=g).to(x)).sum() for x in planes)
+        loss = sum((x * torch.randn(x.shape, generator=g).to(x)).sum() for x in (images.rgb, images.alpha))
         return images, list(torch.autograd.grad(loss, leaves))
 
 
@@ -109,11 +107,11 @@ def inputs() -> Callable[..., Inputs]:
 
 
 @pytest.fixture
-def case() -> Callable[[str, bool], Inputs]:
-    """Makes the arguments of one of the :data:`CASES`, with or without depth."""
+def case() -> Callable[[str], Inputs]:
+    """Makes the arguments of one of the :data:`CASES`."""
 
-    def make(name: str, depth: bool) -> Inputs:
-        given = replace(make_inputs(**CASES[name]), depth=depth)
+    def make(name: str) -> Inputs:
+        given = make_inputs(**CASES[name])
         given.opacities[:, 1::9] = 1e-3  # below 1/255
         return given
 

@@ -142,10 +142,6 @@ class Rendered:
 
     rgb: Float[Tensor, "B V H W 3"]  # colour composited over the background, linear in the input colours, not clamped
     alpha: Float[Tensor, "B V H W"]  # accumulated opacity in [0, 1]
-    # accumulated depth sum_i w_i z_i [scene units], where kernel i contributes w_i = alpha_i T_i to the pixel and
-    # has depth z_i at its centre along the camera's axis (gsplat's mode "D"), not divided by ``alpha``, without
-    # the background, 0 where no kernel contributes. None unless requested
-    depth: Float[Tensor, "B V H W"] | None = None
 
 
 @runtime_checkable
@@ -163,10 +159,9 @@ class Renderer(Protocol):
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
-        depth: bool = False,
     ) -> Rendered:
         """Renders B states (of one scene, or of scenes of equal K) in V views each at ``size`` = (width, height).
 
         Colours are given per view because they are evaluated for its viewing directions. Without a background it is
-        black. ``depth`` requests the depth as well.
+        black.
         """

@@ -38,16 +38,15 @@ class AutoRenderer:
         self.cpu = CpuRenderer(threads=threads, near=near)
         self.gsplat = gsplat.GsplatRenderer(near=near)
 
-    def __call__(self, means: Tensor, *inputs: Any, background: Tensor | None = None, depth: bool = False) -> Rendered:
+    def __call__(self, means: Tensor, *inputs: Any, background: Tensor | None = None) -> Rendered:
         """Draws B states in V views each; the arguments are those of core.Renderer."""
         if chosen(means.device.type) == "gsplat":
-            return self.gsplat(means, *inputs, background=background, depth=depth)
+            return self.gsplat(means, *inputs, background=background)
         *tensors, size = inputs
         kernels, covars, colors, opacities, viewmats, Ks = (value.cpu() for value in (means, *tensors))
-        options: dict[str, Any] = {"background": None if background is None else background.cpu(), "depth": depth}
-        images = self.cpu(kernels, covars, colors, opacities, viewmats, Ks, size, **options)
-        planes = None if images.depth is None else images.depth.to(means.device)
-        return Rendered(images.rgb.to(means.device), images.alpha.to(means.device), planes)
+        behind = None if background is None else background.cpu()
+        images = self.cpu(kernels, covars, colors, opacities, viewmats, Ks, size, background=behind)
+        return Rendered(images.rgb.to(means.device), images.alpha.to(means.device))
 
 
 @functools.cache

@@ -61,7 +61,6 @@ def draw(
     *,
     background: Float[Tensor, " 3"] | None = None,
     mask: Bool[Tensor, " K"] | None = None,
-    depth: bool = False,
 ) -> Rendered:
     """Draws B deformed states of one scene in every camera (METHOD section 2).
 
@@ -94,7 +93,6 @@ def draw(
         cameras.Ks.to(positions).expand(states, views, 3, 3),
         (cameras.width, cameras.height),
         background=background,
-        depth=depth,
     )
 
 

@@ -75,7 +75,6 @@ class GsplatRenderer:
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
-        depth: bool = False,
     ) -> Rendered:
         """Draws B states in V views each (see core.Renderer). Also differentiable in the background.
 
@@ -94,7 +93,7 @@ class GsplatRenderer:
         if means.shape[1] == 0:  # gsplat divides by the number of kernels
             empty = colors.sum()  # zero; it keeps an image without kernels differentiable
             plane = empty.expand(*views, size[1], size[0])
-            return Rendered(plane[..., None] + behind, plane, plane if depth else None)
+            return Rendered(plane[..., None] + behind, plane)
         image, alpha, _ = self._rasterization(
             means=means,
             quats=None,
@@ -110,11 +109,10 @@ class GsplatRenderer:
             eps2d=DILATION,
             packed=False,
             backgrounds=behind.expand(*views, 3),
-            render_mode="RGB+D" if depth else "RGB",
             # gsplat reads only the upper triangle; the mean with the transpose makes the loss gradient symmetric.
             covars=0.5 * (covars + covars.mT),
         )
-        return Rendered(image[..., :3], alpha[..., 0], image[..., 3] if depth else None)
+        return Rendered(image, alpha[..., 0])
 
     @functools.cached_property
     def _rasterization(self) -> Callable[..., Any]:

@@ -54,7 +54,6 @@ class ReferenceRenderer:
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
-        depth: bool = False,
     ) -> Rendered:
         """Draws B states in V views each (see core.Renderer)."""
         behind = means.new_zeros(3) if background is None else background.to(means)
@@ -65,8 +64,7 @@ class ReferenceRenderer:
             for v in range(views)
         ]
         image, through = (torch.stack(parts).unflatten(0, (states, views)) for parts in zip(*drawn, strict=True))
-        rgb = image[..., :3] + through[..., None] * behind
-        return Rendered(rgb, 1 - through, image[..., 3] if depth else None)
+        return Rendered(image + through[..., None] * behind, 1 - through)
 
     def _view(
         self,
@@ -77,14 +75,14 @@ class ReferenceRenderer:
         viewmat: Float[Tensor, "4 4"],
         K: Float[Tensor, "3 3"],
         size: tuple[int, int],
-    ) -> tuple[Float[Tensor, "H W 4"], Float[Tensor, "H W"]]:
-        """Colour before the background and depth, and remaining transmittance of one view."""
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        """Colour before the background, and remaining transmittance of one view."""
         camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         visible = (camera[:, 2] > self.near) & (opacities >= ALPHA_MIN)
         index = visible.nonzero()[:, 0]
         index = index[torch.argsort(camera[index, 2].detach(), stable=True)]
         mean2d, covar2d = project(camera[index], covars[index], viewmat[:3, :3], K, size)
-        parts = mean2d, inverse_2x2(covar2d), opacities[index, None], colors[index], camera[index, 2:]
+        parts = mean2d, inverse_2x2(covar2d), opacities[index, None], colors[index]
         kernels = torch.cat(parts, 1)
         # Half width and half height of the ellipse within which alpha >= 1/255 [pixels].
         t = 2 * torch.log(255 * opacities[index].detach()).clamp_min(0.0)
@@ -93,15 +91,15 @@ class ReferenceRenderer:
         columns, rows = -(-width // TILE), -(-height // TILE)
         hits = _tile_hits(mean2d.detach(), reach, columns, rows)
         tiles = [self._tile(kernels, hit, TILE * (i % columns), TILE * (i // columns)) for i, hit in enumerate(hits)]
-        image = torch.stack(tiles).reshape(rows, columns, TILE, TILE, 5).transpose(1, 2)
-        image = image.reshape(rows * TILE, columns * TILE, 5)[:height, :width]
-        return image[..., :4], image[..., 4]
+        image = torch.stack(tiles).reshape(rows, columns, TILE, TILE, 4).transpose(1, 2)
+        image = image.reshape(rows * TILE, columns * TILE, 4)[:height, :width]
+        return image[..., :3], image[..., 3]
 
-    def _tile(self, kernels: Float[Tensor, "n 10"], hit: Int[Tensor, " m"], left: int, top: int) -> Tensor:
-        """Colour, depth and remaining transmittance of one tile's pixels, (TILE * TILE, 5)."""
+    def _tile(self, kernels: Float[Tensor, "n 9"], hit: Int[Tensor, " m"], left: int, top: int) -> Tensor:
+        """Colour and remaining transmittance of one tile's pixels, (TILE * TILE, 4)."""
         if hit.numel() == 0:
             # The empty sum keeps an image without kernels differentiable (its loss gradients are zero).
-            return kernels.new_tensor((0.0, 0.0, 0.0, 0.0, 1.0)).expand(TILE * TILE, 5) + kernels[:0].sum()
+            return kernels.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(TILE * TILE, 4) + kernels[:0].sum()
         k = kernels[hit]
         axis = torch.arange(TILE, dtype=k.dtype, device=k.device) + 0.5
         dx = (axis + left)[None, :, None] - k[:, 0]  # (1, x, m)
@@ -114,7 +112,7 @@ class ReferenceRenderer:
         before = torch.cat((torch.ones_like(through[:, :1]), through[:, :-1]), 1)
         weight = torch.where(keep, alpha * before, 0.0)
         ends = torch.cat((torch.ones_like(through[:, :1]), through), 1)
-        return torch.cat((weight @ k[:, 6:10], ends.gather(1, keep.sum(1, keepdim=True))), 1)
+        return torch.cat((weight @ k[:, 6:9], ends.gather(1, keep.sum(1, keepdim=True))), 1)
 
 
 def project(

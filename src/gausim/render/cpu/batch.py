@@ -39,11 +39,10 @@ class Images(NamedTuple):
 
     rgb: Array  # (B, V, H, W, 3)
     alpha: Array  # (B, V, H, W)
-    depth: Array | None  # (B, V, H, W)
 
-    def of(self, b: int, v: int) -> tuple[Array, Array, Array | None]:
+    def of(self, b: int, v: int) -> tuple[Array, Array]:
         """The images of one view."""
-        return self.rgb[b, v], self.alpha[b, v], None if self.depth is None else self.depth[b, v]
+        return self.rgb[b, v], self.alpha[b, v]
 
 
 class Gradients(NamedTuple):
@@ -119,11 +118,10 @@ class Batch:
         """The band of each pixel row."""
         return np.repeat(np.arange(len(self.band_rows)), [last - first + 1 for first, last in self.band_rows])
 
-    def forward(self, pool: WorkerPool, *, keep: bool, depth: bool) -> Images:
+    def forward(self, pool: WorkerPool, *, keep: bool) -> Images:
         """Draws all images; ``keep`` stores the bands for the backward pass."""
         shape = (*self.viewmats.shape[:2], self.height, self.width)
-        rgb, alpha = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-        images = Images(rgb, alpha, np.empty(shape, np.float32) if depth else None)
+        images = Images(np.empty((*shape, 3), np.float32), np.empty(shape, np.float32))
         bands, kernels = range(len(self.band_rows)), ranges(self.means.shape[1], _parts(len(self.pairs)))
 
         def sort(item: tuple[int, int]) -> None:

@@ -14,16 +14,16 @@ from gausim.render.reference import ALPHA_MIN, CLAMP_MARGIN, DILATION
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
 # far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, the exponent below which
-# alpha < 1/255, over 8, and the depth; padded to a cache line.
+# alpha < 1/255, over 8; padded to a cache line.
 RECORD = 16
 # Extent, float32: mean x y, half width X, slack, B/C, -(B/A) Y, t/C, det Q / C^2.
 EXTENT = 8
 SLACK = 0.002  # [pixels] added to every extent, far above the rounding error of extents up to some thousand pixels,
 RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
 
-# Positions in a row of sums over pixels: of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth.
-S, S_X, S_XX, S_Y, S_XY, S_YY, S_RED, S_GREEN, S_BLUE, S_DEPTH = range(10)
-SUMS = 10
+# Positions in a row of sums over pixels: of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3).
+S, S_X, S_XX, S_Y, S_XY, S_YY, S_RED, S_GREEN, S_BLUE = range(9)
+SUMS = 9
 ZERO = np.float32(0)
 AT_ONCE = 64  # kernels whose sums are gathered before they are used
 
@@ -128,7 +128,7 @@ def project_kernels(
         records[k, 4], records[k, 5], records[k, 6] = -a / 16.0, -b / 8.0, -c / 16.0
         records[k, 7] = o
         records[k, 8], records[k, 9], records[k, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
-        records[k, 11], records[k, 12] = -t / 16.0, z
+        records[k, 11] = -t / 16.0
         extents[k, 0], extents[k, 1], extents[k, 2], extents[k, 3] = mx, my, half_x, slack
         extents[k, 4], extents[k, 5] = b / c, -(b / a) * half_y
         extents[k, 6], extents[k, 7] = t / c, 1.0 / (det * c * c)
@@ -250,6 +250,5 @@ def project_adjoint(
         cam_y = ey * gv - free_y * ey * rz * j12
         cam_z = -ex * frame[0] * rz * gu - ey * frame[1] * rz * gv
         cam_z += ex * rz * (qx * (1.0 + free_x) * j02 - j00) + ey * rz * (qy * (1.0 + free_y) * j12 - j11)
-        cam_z += total[S_DEPTH]
         for j in range(3):
             grad_means[k, j] += cam_x * viewmat[0, j] + cam_y * viewmat[1, j] + cam_z * viewmat[2, j]

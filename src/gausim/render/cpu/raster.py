@@ -2,9 +2,8 @@
 
 A tile is 8 x 16 pixels, numbered row by row. The innermost loops run over the pixels of a tile that a kernel may touch,
 without branches and within one flat array, so that LLVM turns them into vector instructions. Validity is decided on the
-exponent, because the polynomial is invalid outside its range. ``depth`` is an image or None; numba compiles both cases
-separately, so that images without depth cost no more. ``records`` and ``entries`` are those of projection.py and
-binning.py.
+exponent, because the polynomial is invalid outside its range. ``records`` and ``entries`` are those of projection.py
+and binning.py.
 """
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
@@ -18,7 +17,6 @@ from gausim.kernels.jit import HELPER, KERNEL
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
 from gausim.render.cpu.projection import (
     S_BLUE,
-    S_DEPTH,
     S_GREEN,
     S_RED,
     S_X,
@@ -66,8 +64,8 @@ def mean_in_tile(records, g, left, top):
 
 
 @numba.njit(fastmath=True, **HELPER)
-def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth):
-    """Composites the entries ``begin .. end - 1`` into ``buf`` = [T | R | G | B | D | last | x | y] (8, PIXELS).
+def forward_tile(records, entries, begin, end, left, top, alpha_max, buf):
+    """Composites the entries ``begin .. end - 1`` into ``buf`` = [T | R | G | B | last | x | y] (7, PIXELS).
 
     T turns negative where the pixel is closed; ``last`` is the row of the last kernel that contributed.
 
@@ -76,8 +74,8 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth)
     """
     for i in range(PIXELS):
         buf[i] = ONE
-        buf[PIXELS + i] = buf[2 * PIXELS + i] = buf[3 * PIXELS + i] = buf[4 * PIXELS + i] = ZERO
-        buf[5 * PIXELS + i] = -ONE
+        buf[PIXELS + i] = buf[2 * PIXELS + i] = buf[3 * PIXELS + i] = ZERO
+        buf[4 * PIXELS + i] = -ONE
     for e in range(begin, end):
         if (e - begin) % CHECK_EVERY == CHECK_EVERY - 1:
             open_ = -ONE
@@ -90,9 +88,9 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth)
         row = np.float32(g)
         mx, my = mean_in_tile(records, g, left, top)
         a, b, c, o, cut = records[g, 4], records[g, 5], records[g, 6], records[g, 7], records[g, 11]
-        red, green, blue, far = records[g, 8], records[g, 9], records[g, 10], records[g, 12]
+        red, green, blue = records[g, 8], records[g, 9], records[g, 10]
         for i in range(((packed >> 4) & 15) * PAIR, (packed & 15) * PAIR + PAIR):
-            dx, dy = buf[6 * PIXELS + i] - mx, buf[7 * PIXELS + i] - my
+            dx, dy = buf[5 * PIXELS + i] - mx, buf[6 * PIXELS + i] - my
             u = dx * (a * dx + b * dy) + c * dy * dy
             alpha = min(o * exponential(u), alpha_max) if u >= cut else ZERO
             t = buf[i]
@@ -102,23 +100,21 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth)
             buf[PIXELS + i] += w * red
             buf[2 * PIXELS + i] += w * green
             buf[3 * PIXELS + i] += w * blue
-            if depth is not None:
-                buf[4 * PIXELS + i] += w * far
-            buf[5 * PIXELS + i] = max(buf[5 * PIXELS + i], row if w > ZERO else -ONE)
+            buf[4 * PIXELS + i] = max(buf[4 * PIXELS + i], row if w > ZERO else -ONE)
             buf[i] = after if keep else -abs(t)
     return end
 
 
 @numba.njit(fastmath=True, **HELPER)
-def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums, depth):
-    """Adds the tile's part to ``sums`` (rows, SUMS); ``buf`` = [T | B | vr | vg | vb | vd | last | x | y] (9, PIXELS).
+def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums):
+    """Adds the tile's part to ``sums`` (rows, SUMS); ``buf`` = [T | B | vr | vg | vb | last | x | y] (8, PIXELS).
 
     Runs back to front: B is the derivative with respect to the transmittance behind the current kernel, by the
     recursion B <- B + alpha (d - B) with d = v . colour of the kernel; T is the transmittance in front of it.
     """
     final = -ONE
     for i in range(PIXELS):
-        final = max(final, buf[6 * PIXELS + i])
+        final = max(final, buf[5 * PIXELS + i])
     for e in range(end - 1, begin - 1, -1):
         packed = entries[e]
         g = packed >> 8
@@ -127,24 +123,19 @@ def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums,
             continue
         mx, my = mean_in_tile(records, g, left, top)
         a, b, c, o, cut = records[g, 4], records[g, 5], records[g, 6], records[g, 7], records[g, 11]
-        red, green, blue, far = records[g, 8], records[g, 9], records[g, 10], records[g, 12]
+        red, green, blue = records[g, 8], records[g, 9], records[g, 10]
         m0, m1, m2, m11, m12, m22 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-        s_red, s_green, s_blue, s_far = ZERO, ZERO, ZERO, ZERO
+        s_red, s_green, s_blue = ZERO, ZERO, ZERO
         for i in range(((packed >> 4) & 15) * PAIR, (packed & 15) * PAIR + PAIR):
-            dx, dy = buf[7 * PIXELS + i] - mx, buf[8 * PIXELS + i] - my
+            dx, dy = buf[6 * PIXELS + i] - mx, buf[7 * PIXELS + i] - my
             u = dx * (a * dx + b * dy) + c * dy * dy
             raw = o * exponential(u)
-            alpha = min(raw, alpha_max) if (u >= cut) & (buf[6 * PIXELS + i] >= row) else ZERO
+            alpha = min(raw, alpha_max) if (u >= cut) & (buf[5 * PIXELS + i] >= row) else ZERO
             t = buf[i] / (ONE - alpha)
             buf[i] = t
             w = alpha * t
             vr, vg, vb = buf[2 * PIXELS + i], buf[3 * PIXELS + i], buf[4 * PIXELS + i]
-            shown = vr * red + vg * green + vb * blue
-            if depth is not None:
-                vd = buf[5 * PIXELS + i]
-                shown += vd * far
-                s_far += w * vd
-            gap = shown - buf[PIXELS + i]
+            gap = vr * red + vg * green + vb * blue - buf[PIXELS + i]
             buf[PIXELS + i] += alpha * gap
             s = w * gap if raw <= alpha_max else ZERO  # at its ceiling alpha does not depend on the exponent
             sx, sy = s * dx, s * dy
@@ -166,27 +157,24 @@ def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums,
         sums[g, S_RED] += s_red
         sums[g, S_GREEN] += s_green
         sums[g, S_BLUE] += s_blue
-        sums[g, S_DEPTH] += s_far
 
 
 @numba.njit(fastmath=True, **KERNEL)
-def forward_band(records, entries, start, row_low, background, alpha_max, rgb, alpha, depth, final, last, used):
-    """Draws one band into ``rgb`` (H, W, 3), ``alpha`` (H, W) and, unless it is None, ``depth`` (H, W).
+def forward_band(records, entries, start, row_low, background, alpha_max, rgb, alpha, final, last, used):
+    """Draws one band into ``rgb`` (H, W, 3) and ``alpha`` (H, W).
 
     ``final`` and ``last`` (tiles, PIXELS) receive the remaining transmittance and the row of the last kernel that
     contributed, ``used`` (tiles,) one past the last entry that was read.
     """
     height, width = alpha.shape
     strips = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    buf = np.empty(8 * PIXELS, np.float32)
-    write_grid(buf, 6 * PIXELS)
+    buf = np.empty(7 * PIXELS, np.float32)
+    write_grid(buf, 5 * PIXELS)
     for tile in range(start.shape[0] - 1):
         top, left = row_low + tile // strips * TILE_HEIGHT, tile % strips * TILE_WIDTH
-        used[tile] = forward_tile(
-            records, entries, start[tile], start[tile + 1], left, top, alpha_max, buf, depth
-        )  # fmt: skip
+        used[tile] = forward_tile(records, entries, start[tile], start[tile + 1], left, top, alpha_max, buf)
         for i in range(PIXELS):
-            final[tile, i], last[tile, i] = abs(buf[i]), buf[5 * PIXELS + i]
+            final[tile, i], last[tile, i] = abs(buf[i]), buf[4 * PIXELS + i]
         for y in range(top, min(top + TILE_HEIGHT, height)):
             for x in range(left, min(left + TILE_WIDTH, width)):
                 i = (y - top) * TILE_WIDTH + x - left
@@ -194,15 +182,13 @@ def forward_band(records, entries, start, row_low, background, alpha_max, rgb, a
                 for c in range(3):
                     rgb[y, x, c] = buf[(1 + c) * PIXELS + i] + t * background[c]
                 alpha[y, x] = ONE - t
-                if depth is not None:
-                    depth[y, x] = buf[4 * PIXELS + i]
 
 
 @numba.njit(fastmath=True, **HELPER)
-def read_tile(grad_rgb, grad_alpha, grad_depth, background, left, top, buf):
-    """Fills [B | vr | vg | vb | vd] of ``buf`` with the loss gradients of a tile's pixels, 0 beyond the edge."""
+def read_tile(grad_rgb, grad_alpha, background, left, top, buf):
+    """Fills [B | vr | vg | vb] of ``buf`` with the loss gradients of a tile's pixels, 0 beyond the edge."""
     height, width = grad_alpha.shape
-    buf[PIXELS : 6 * PIXELS] = ZERO
+    buf[PIXELS : 5 * PIXELS] = ZERO
     for y in range(top, min(top + TILE_HEIGHT, height)):
         for x in range(left, min(left + TILE_WIDTH, width)):
             i = (y - top) * TILE_WIDTH + x - left
@@ -210,35 +196,30 @@ def read_tile(grad_rgb, grad_alpha, grad_depth, background, left, top, buf):
             for c in range(3):
                 behind += grad_rgb[y, x, c] * background[c]
                 buf[(2 + c) * PIXELS + i] = grad_rgb[y, x, c]
-            if grad_depth is not None:
-                buf[5 * PIXELS + i] = grad_depth[y, x]
             buf[PIXELS + i] = behind
 
 
 @numba.njit(fastmath=True, **KERNEL)
 def backward_band(
-    records, entries, start, row_low, background, alpha_max, grad_rgb, grad_alpha, grad_depth, final, last, used, sums,
-    behind,
-):  # fmt: skip
+    records, entries, start, row_low, background, alpha_max, grad_rgb, grad_alpha, final, last, used, sums, behind
+):
     """Adjoint of :func:`forward_band`: writes the band's ``sums`` (rows, SUMS).
 
-    ``grad_depth`` is None without depth; ``behind`` (3,), float64 or None, receives the background's loss gradient.
+    ``behind`` (3,), float64 or None, receives the background's loss gradient.
     """
     strips = (grad_alpha.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
-    buf = np.empty(9 * PIXELS, np.float32)
-    write_grid(buf, 7 * PIXELS)
+    buf = np.empty(8 * PIXELS, np.float32)
+    write_grid(buf, 6 * PIXELS)
     sums[:] = ZERO
     for tile in range(start.shape[0] - 1):
         if behind is None and used[tile] == start[tile]:
             continue
         top, left = row_low + tile // strips * TILE_HEIGHT, tile % strips * TILE_WIDTH
-        read_tile(grad_rgb, grad_alpha, grad_depth, background, left, top, buf)
+        read_tile(grad_rgb, grad_alpha, background, left, top, buf)
         for i in range(PIXELS):
-            buf[i], buf[6 * PIXELS + i] = final[tile, i], last[tile, i]
+            buf[i], buf[5 * PIXELS + i] = final[tile, i], last[tile, i]
         if behind is not None:
             for i in range(PIXELS):
                 for c in range(3):
                     behind[c] += final[tile, i] * buf[(2 + c) * PIXELS + i]
-        backward_tile(
-            records, entries, start[tile], used[tile], left, top, alpha_max, buf, sums, grad_depth
-        )  # fmt: skip
+        backward_tile(records, entries, start[tile], used[tile], left, top, alpha_max, buf, sums)

@@ -24,31 +24,30 @@ class _Render(torch.autograd.Function):
     def forward(
         ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, background: Tensor, *rest: Any
     ) -> Any:
-        pool, keep, depth, viewmats, Ks, *options = rest
+        pool, keep, viewmats, Ks, *options = rest
         arrays: Any = map(array, (means, covars, colors, opacities, viewmats, Ks, background))
         batch = Batch(*arrays, *options)
-        images = batch.forward(pool, keep=keep, depth=depth)
+        images = batch.forward(pool, keep=keep)
         if keep:
             ctx.save_for_backward(means, covars, colors, opacities, background)
             ctx.batch, ctx.pool = batch, pool
             ctx.set_materialize_grads(False)
-        return tuple(None if image is None else torch.from_numpy(image) for image in images)
+        return tuple(map(torch.from_numpy, images))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None, grad_depth: Tensor | None) -> Any:
+    def backward(ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since then: the batch uses the same memory
         batch, needed = ctx.batch, ctx.needs_input_grad[:5]
         shape = (*batch.viewmats.shape[:2], batch.height, batch.width)
         images = Images(
             np.zeros((*shape, 3), np.float32) if grad_rgb is None else array(grad_rgb),
             np.zeros(shape, np.float32) if grad_alpha is None else array(grad_alpha),
-            None if grad_depth is None else array(grad_depth),
         )
         grads = batch.backward(ctx.pool, images, background=needed[4])
         return (
             *(torch.from_numpy(grad) if need else None for grad, need in zip(grads, needed, strict=True)),
-            *[None] * 9,
+            *[None] * 8,
         )
 
 
@@ -86,7 +85,6 @@ class CpuRenderer:
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
-        depth: bool = False,
     ) -> Rendered:
         """Draws B states in V views each (see core.Renderer). Tensors must be float32 on the CPU.
 
@@ -107,4 +105,4 @@ class CpuRenderer:
         pool = shared_pool(self.threads or torch.get_num_threads())
         options = (*size, self.near, np.float32(self.alpha_max))
         with announced("the CPU renderer"):
-            return Rendered(*_Render.apply(*inputs.values(), pool, keep, depth, viewmats, Ks, *options))
+            return Rendered(*_Render.apply(*inputs.values(), pool, keep, viewmats, Ks, *options))
