@@ -87,12 +87,6 @@ def test_pictures(run) -> None:
         assert image.n_frames == 2 and image.size == (40, 40) and min(image.convert("RGB").getpixel((0, 0))) > 245
 
 
-def test_a_recording(run) -> None:
-    pytest.importorskip("viser", reason="needs viser (extra view)")
-    assert export.main([str(run.run_dir), "--format", "viser", "--frames", "3"]) == 0
-    assert Path("toy_seq_000.viser").stat().st_size > 1000
-
-
 def test_a_compact_motion_and_its_page(run, capsys) -> None:
     source = str(run.run_dir)
     assert export.main([source, "--format", "motion", "--frames", "6", "--every", "2"]) == 0

@@ -152,7 +152,7 @@ def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interact
 def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interaction: Callable[..., Interaction]) -> None:
     interaction = make_interaction()
     trajectory = make_interaction()._dynamics.rollout(interaction.state, 5)
-    one = Live(interaction, lambda _: None, takes=[Take("Predicted: a", lambda: trajectory, "a")])
+    one = Live(interaction, lambda _: None, takes=[Take("Predicted: a", lambda: trajectory)])
     one.choose("Predicted: a")
     with pytest.raises(ConfigError, match=LIVE):
         one.act(Reset())

@@ -1,11 +1,10 @@
-"""The viewer's parts without a browser: packing, colours, picking, queues, recordings."""
+"""The viewer's parts without a browser: packing, colours, picking, queues."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,10 +14,8 @@ from torch import Tensor
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
-import msgspec
-import zstandard
 
-from gausim.core import DataError, DivergenceError, Frame, GaussianScene, Trajectory
+from gausim.core import Frame, GaussianScene
 from gausim.interaction.interaction import Interaction
 from gausim.models.template.template import Property
 from gausim.ops.covariance import covariance_from_scales
@@ -26,7 +23,6 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, hues
 from gausim.viewer.pipeline import Worker
 from gausim.viewer.pointer import first_hit, in_rectangle
-from gausim.viewer.recording import record
 from gausim.viewer.splats import Placing, half_covariances, pack
 
 
@@ -170,45 +166,3 @@ def test_a_worker_takes_the_newest_item_and_outlives_an_error() -> None:
     worker.stop()
     worker.join(5)
     assert not worker.is_alive()
-
-
-def still(scene: GaussianScene, frames: int) -> Trajectory:
-    identity = torch.eye(3).expand(frames, 1, 3, 3)
-    unit = torch.zeros(scene.count, dtype=torch.long)
-    positions = scene.means.expand(frames, -1, -1).clone()
-    positions += 0.01 * torch.arange(frames)[:, None, None]
-    return Trajectory(positions, identity, identity, unit, 10.0)
-
-
-def test_a_recording_holds_every_frame(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
-    scene = make_column()
-    record(scene, still(scene, 5), tmp_path / "a.viser")
-    data = (tmp_path / "a.viser").read_bytes()
-    inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
-    length = int.from_bytes(inner[:8], "little")
-    facts = msgspec.msgpack.decode(inner[8 : 8 + length])
-    assert facts["durationSeconds"] == pytest.approx(0.5)
-    updates = [m for m in facts["messages"] if m[1]["type"] == "SceneNodeUpdateMessage"]
-    times = sorted({round(m[0], 6) for m in updates if "buffer" in m[1]["updates"]})
-    assert times == [0.0, 0.1, 0.2, 0.3, 0.4]
-    offset = 8 + length
-    wanted = Placing.of(scene).to_page(still(scene, 5).positions[4])
-    found = False
-    for size in facts["binaryBufferLengths"]:
-        offset += -offset % 8
-        if size == 32 * scene.count:
-            rows = np.frombuffer(inner[offset : offset + size], np.uint32).reshape(-1, 8)
-            found |= bool(torch.equal(torch.from_numpy(rows[:, :3].copy().view(np.float32)), wanted))
-        offset += size
-    assert found, "the last frame's positions are not in the file"
-
-
-def test_what_cannot_be_recorded_is_said(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
-    scene, path = make_column(), tmp_path / "a.viser"
-    with pytest.raises(DataError, match="kernels"):
-        record(make_column(80), still(scene, 2), path)
-    broken = still(scene, 3)
-    broken.positions[1, 4] = float("nan")
-    with pytest.raises(DivergenceError, match="frame 1"):
-        record(scene, broken, path)
-    assert not path.exists()

@@ -182,10 +182,6 @@ def _write(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
 
             background, camera = parse_background(arguments.background), _camera(motion, arguments)
             save_player(path, scene, trajectory, camera, up=up, background=background)
-        case "viser":
-            from gausim.viewer.recording import record
-
-            record(scene, trajectory, path, up=up)
     return motion.frames
 
 
@@ -236,7 +232,6 @@ FORMATS = {
     "html": Format(".html", "as motion, in one page that plays in a browser without a network", "as motion"),
     "gltf": Format("", "a GLB per frame (KHR_gaussian_splatting)", "masks, units, frame rate"),
     "usd": Format(".usdc", "a ParticleField3DGaussianSplat with time samples", "masks, units"),
-    "viser": Format(".viser", "positions, covariances (float16), base colours", "spherical harmonics, masks, units"),
     "mp4": Format(".mp4", "pictures of one camera", "everything else"),
     "gif": Format(".gif", "pictures of one camera, 256 colours", "everything else"),
 }

@@ -1,4 +1,4 @@
-"""Content of the viewer for a run or a bare scene: interactions, recordings, videos, cameras."""
+"""Content of the viewer for a run or a bare scene: interactions, predictions, cameras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Property
 from gausim.viewer.live import Companion
 from gausim.viewer.shown import Take
-from gausim.viewer.subject import Films, Subject
+from gausim.viewer.subject import Subject
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +45,18 @@ def playable_run(
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """The complete content of the viewer."""
-    films = cameras = companion = None
+    cameras = companion = None
     material: dict[str, Property] = {}
     other = {} if beside is None else beside.predictions()
-    takes = [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
+    takes = [Take(f"Predicted: {name}", load, other.get(name)) for name, load in made.predictions().items()]
     if made.run is not None and made.item is not None:
-        records = {record.name: record for record in made.item.data.sequences}
-        films = Films(records, made.interaction.scene, made.run.renderer)
-        cameras = next(iter(records.values())).cameras
+        cameras = made.item.data.sequences[0].cameras
         if isinstance(made.run.module.model, SceneModel):
             material = made.run.module.model.material(made.item.scene_id)
     if beside is not None and beside.run is not None:
         name = f"{beside.run.module.method_name} ({Path(beside.run.run_dir).name})"
         companion = Companion(name, beside.interaction)
     return Subject(
-        title=title, interaction=made.interaction, takes=takes, companion=companion, films=films, cameras=cameras,
+        title=title, interaction=made.interaction, takes=takes, companion=companion, cameras=cameras,
         material=material, up=up, sessions=sessions,
     )  # fmt: skip

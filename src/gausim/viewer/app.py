@@ -154,4 +154,3 @@ class Viewer:
         paused = not self.live.playing  # this frame must be displayed, as no other may follow
         displayed = 0.0 if paused else self._sent.per_second
         self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
-        self.camera_panel.refresh(painted.shown, now=paused)

@@ -1,25 +1,20 @@
-"""Cameras of the data set: the initial view, the list of views, and the recorded videos."""
+"""Cameras of the data set: the initial view and the list of views."""
 
 from __future__ import annotations
 
-import html
 import math
-import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gausim.core import Cameras, GausSimError
+from gausim.core import Cameras
 from gausim.interaction.words import parse_direction
-from gausim.viewer.shown import LIVE, Shown
 from gausim.viewer.splats import SIZE, Placing
 
 if TYPE_CHECKING:
     from gausim.viewer.subject import Subject
 
 _FREE = "Free"
-# Largest update rate of video frames [1 / s].
-_PICTURES = 6.0
 # Vertical field of view without cameras [rad].
 _HEIGHT_OF_VIEW = 0.8
 # Distance of two objects side by side, in widths of the object.
@@ -27,7 +22,7 @@ _APART = 1.25
 
 
 class CameraPanel:
-    """The cameras of one viewer and the panel of videos, if the subject has any.
+    """The cameras of one viewer.
 
     Attributes:
         up: vertical direction.
@@ -37,9 +32,7 @@ class CameraPanel:
     """
 
     def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
-        self._server, self._placing, self._films = server, placing, subject.films
-        self._cameras = subject.cameras
-        self._takes = {take.name: take.sequence for take in subject.takes}
+        self._server, self._placing, self._cameras = server, placing, subject.cameras
         self.up = np.array(parse_direction(subject.up))
         self.first_position, target, fov = self._first()
         self.forward = (target - self.first_position) / np.linalg.norm(target - self.first_position)
@@ -51,11 +44,8 @@ class CameraPanel:
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = self.first_position, target, self.up
         camera.fov = fov
-        self._drawn = 0.0
         if self._cameras is not None:
             self._add_cameras(self._cameras)
-        if self._films is not None:
-            self._add_films(self._films)
 
     def _aside(self, subject: Subject) -> np.ndarray:
         """Offset to the right of the initial view by slightly more than the object's width."""
@@ -97,43 +87,3 @@ class CameraPanel:
                 camera.up_direction, camera.position, camera.look_at, camera.fov = up, position, target, fov
 
         choice.on_update(look_from)
-
-    def _add_films(self, films: Any) -> None:
-        gui = self._server.gui
-        with gui.add_folder("Recorded video", expand_by_default=False):
-            self._on = gui.add_checkbox("Compare with the video", False, hint="While a recording is shown")
-            self._view = gui.add_dropdown("Camera", films.views, initial_value=films.views[0])
-            self._said = gui.add_html("")
-            blank = np.zeros((8, 16, 3), np.uint8)
-            self._picture = gui.add_image(blank, label="recorded | shown", format="png", visible=False)
-
-    def refresh(self, shown: Shown, *, now: bool = False) -> None:
-        """Displays the recorded and the shown frame for the chosen camera, if the shown source has a recording."""
-        if self._films is None:
-            return
-        moment = time.monotonic()
-        if not now and moment - self._drawn < 1 / _PICTURES:
-            return
-        self._drawn = moment
-        sequence = self._takes.get(shown.source) if shown.source != LIVE else None
-        view = self._view.value
-        on = bool(self._on.value) and sequence is not None and view in self._films.views
-        self._picture.visible = on
-        if not on or sequence is None:
-            self._say("Choose a recording under Play to compare." if self._on.value else "")
-            return
-        try:
-            truth = self._films.truth(sequence, view, shown.number)
-            drawn = self._films.drawn(sequence, view, shown)
-        except GausSimError as error:
-            self._say(str(error))
-            return
-        self._say("" if truth is not None else "The recording is over.")
-        left = truth if truth is not None else np.zeros_like(drawn)
-        line = np.full((drawn.shape[0], 2, 3), 255, np.uint8)
-        self._picture.image = np.concatenate((left, line, drawn), 1)
-
-    def _say(self, text: str) -> None:
-        content = f"<div style='padding:0 .6em;font-size:.8em'>{html.escape(text)}</div>" if text else ""
-        if self._said.content != content:
-            self._said.content = content

@@ -42,7 +42,6 @@ class Take:
 
     name: str  # name on the page
     load: Callable[[], Trajectory]  # computes the trajectory, called at its first use
-    sequence: str | None = None  # the predicted sequence, or None
     # computes the second method's prediction of the same sequence, or None
     beside: Callable[[], Trajectory] | None = None
 
