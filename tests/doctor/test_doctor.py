@@ -86,18 +86,14 @@ def found(entry: dict) -> dict[str, dict]:
     return {f["check"]: f for f in reversed(entry["findings"]) if f["severity"] != "note"}
 
 
-def test_a_good_object_has_no_fault_and_no_warning_and_a_page(
+def test_a_good_object_has_no_fault_and_no_warning_and_two_pictures(
     swaying: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "seen"
     status, entry = told(swaying, capsys, "--out", str(out))
     assert status == 0 and not entry["ruinous"] and not entry["faults"] and not entry["left_out"]
     assert found(entry) == {}
-    page = (out / "index.html").read_text()
-    assert "nothing is wrong (4 cameras, 4 sequences" in page
-    for name in ("views.png", "motion.png"):
-        picture = cv2.imread(str(out / name))
-        assert f'src="{name}"' in page and picture.std() > 5
+    assert all(cv2.imread(str(out / name)).std() > 5 for name in ("views.png", "motion.png"))
     orange = cv2.imread(str(out / "views.png"))[..., ::-1].astype(int)
     outline = (orange[..., 0] > 200) & (abs(orange[..., 1] - 150) < 30) & (orange[..., 2] < 90)
     assert outline.sum() > 200
@@ -166,16 +162,6 @@ def tiny(root: Path) -> None:
     mistakes.every_image(root, shrink)
 
 
-def plain(root: Path) -> None:
-    def white_block(pixels: np.ndarray) -> np.ndarray:
-        block = np.zeros_like(pixels)
-        block[20:44, 24:40] = 255
-        return block
-
-    mistakes.every_image(root, white_block)
-    (root / "scene.ply").unlink()
-
-
 def few_frames(root: Path) -> None:
     """Every third frame is kept, forth and back, so that a swing takes less than two frames."""
     there = [*range(0, 32, 3), *range(30, 0, -3)]
@@ -206,7 +192,6 @@ MORE = {
                      "seq_000 frame 10"),
     cut_off: ("views", "warning", "The object is cut off at the left of cam_1"),
     tiny: ("views", "warning", "The object is tiny in cam_"),
-    plain: ("appearance", "note", "The object is plain"),
     few_frames: ("motion", "warning", "too fast for steps of a frame"),
     late_in_one_sequence: ("clock", "fault", "3 frames later than the other cameras, in seq_002"),
     late_without_scene: ("clock", "fault", "cam_0 is out of step"),
@@ -284,15 +269,6 @@ def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert told(spoilt, capsys, "--pin", "below z=0.1")[0] == 0
     status, entry = told(spoilt, capsys, "--pin", "below z=9")
     assert status == 1 and "pins" in found(entry)
-
-
-@pytest.mark.slow
-def test_the_page_shows_findings_and_escapes_names(spoilt: Path, tmp_path: Path) -> None:
-    edit_json(spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
-    MISTAKES["one camera moved"](spoilt)
-    assert main(["doctor", str(spoilt), "--out", str(tmp_path / "seen")]) == 1
-    page = (tmp_path / "seen" / "index.html").read_text()
-    assert "cam_1 is not where the pose says" in page and "&lt;b&gt;$x$" in page and "<b>$" not in page
 
 
 def test_a_scene_that_is_not_there(swaying: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -44,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", metavar="SCENE.ply", type=Path, help="take this rest scene (default: ROOT/scene.ply)")
     add("--masks", metavar="FILE", type=Path, help="take its masks (npz) from there (default: beside the scene)")
     add_pin_option(parser)
-    add("--out", metavar="DIR", type=Path, help="write pictures and a page (index.html) to this folder (default: none)")
+    add("--out", metavar="DIR", type=Path, help="write views.png and motion.png to this folder (default: none)")
     add("--json", action="store_true", help="print an object: {DIRECTORY: {ruinous, faults, findings, left_out}}")
     add_threads_option(parser)
     return parser
@@ -55,7 +55,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     from gausim.data.objects import ObjectData
     from gausim.data.verify import verify
     from gausim.doctor.examine import examine
-    from gausim.doctor.page import findings_text, plain_findings, write_page
+    from gausim.doctor.text import findings_text, plain_findings
 
     # Masks and pins are checked below: options may set them, and missing pins are one of the findings.
     faults = verify(root, quick=True, scene=False)
@@ -72,9 +72,9 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     if out is not None and found.evidence is not None:
         from gausim.doctor.pictures import draw_pictures  # loads Matplotlib
 
-        write_page(out / "index.html", found, draw_pictures(found.evidence, out))
+        draw_pictures(found.evidence, out)
         if not arguments.json:
-            print(f"page  {out / 'index.html'}")
+            print(f"pictures  {out}")
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
 

@@ -21,7 +21,7 @@ from gausim.compose.train import is_first, plain
 from gausim.compose.train import train as train_run_directory
 from gausim.core import RunError
 from gausim.doctor.examine import examine
-from gausim.doctor.page import findings_text
+from gausim.doctor.text import findings_text
 from gausim.runs.directory import RunDirectory
 
 

@@ -1,38 +1,18 @@
-"""Checks of appearance: texture, which loss gradients need, and constant exposure."""
+"""Checks of appearance: constant exposure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 from scipy.ndimage import median_filter
 
 from gausim.doctor.evidence import Evidence, Finding, listed
 
-# Mean slope of the colours within the object below which it counts as plain [1/255 per reduced pixel].
-_PLAIN = 2.5
 # Relative jumps of brightness over time, the fraction of frames with them, and difference between cameras.
 _FLICKER, _OFTEN, _BETWEEN = 0.03, 0.1, 0.15
-# Smallest alpha of opaque pixels, and distance of the interior from the edge [reduced pixels].
-_OPAQUE, _INSIDE = 230, 3
-
-
-def find_plain(evidence: Evidence) -> Iterator[Finding]:
-    """Finds objects of nearly constant colour."""
-    item, slopes = evidence.first[0], []
-    kernel = np.ones((2 * _INSIDE + 1, 2 * _INSIDE + 1), np.uint8)
-    for alpha, gray in zip(item.alpha[0], item.gray[0] * 255, strict=True):
-        inside = cv2.erode((alpha > _OPAQUE).astype(np.uint8), kernel) > 0
-        if inside.sum() > 20:
-            slopes.append(float(np.hypot(*np.gradient(gray))[inside].mean()))
-    if slopes and float(np.median(slopes)) < _PLAIN:
-        yield Finding(
-            "note", "likely",
-            f"The object is plain: its colours change by {np.median(slopes):.1f} of 255 per pixel, so only its outline "
-            "tells how it moves.",
-            "Training works from outlines too, less exactly. A pattern (paint, stickers, printed cloth) helps.",
-        )  # fmt: skip
+# Smallest alpha of opaque pixels.
+_OPAQUE = 230
 
 
 def find_flicker(evidence: Evidence) -> Iterator[Finding]:
@@ -50,7 +30,7 @@ def find_flicker(evidence: Evidence) -> Iterator[Finding]:
     flickers = [view for view, fraction in fractions.items() if fraction > _OFTEN]
     if flickers:
         yield Finding(
-            "warning", "likely",
+            "warning",
             f"The brightness of {listed(flickers)} jumps from frame to frame (by more than {_FLICKER:.0%} in "
             f"{max(fractions.values()):.0%} of the frames): automatic exposure, or lamps on mains.",
             "Film with fixed exposure, at a shutter time that suits the mains (1/50 or 1/100 s at 50 Hz).",
@@ -71,7 +51,7 @@ def find_uneven(evidence: Evidence) -> Iterator[Finding]:
     if other:
         told = ", ".join(f"{view} {gains[view] / usual - 1:+.0%}" for view in other)
         yield Finding(
-            "warning", "likely",
+            "warning",
             f"Brightness differs between cameras, compared with the rest scene: {told}.",
             "Set exposure and white balance alike and fixed, or correct the pictures of this camera.",
         )  # fmt: skip

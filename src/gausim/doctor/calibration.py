@@ -33,7 +33,7 @@ def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
     """Compares the rest scene's silhouettes with frame 0 in every camera, and tests other conventions."""
     if evidence.fits is None:
         yield Finding(
-            "note", "certain", "There is no rest scene yet, so poses and lenses were not compared with it.",
+            "note", "There is no rest scene yet, so poses and lenses were not compared with it.",
             f"Make one with `gausim reconstruct {evidence.data.root}` (or give --scene FILE.ply) and run this again.",
         )  # fmt: skip
         return
@@ -82,8 +82,7 @@ def _moved(evidence: Evidence, fits: dict[str, tuple[Fit, ...]]) -> Iterator[Fin
             "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
         )
     spoils = max(off[view] for view in worth) > _SPOILS * longer
-    sure = spoils and min(fit.aligned for row in fits.values() for fit in row) > _SHAPE
-    yield Finding("fault" if spoils else "warning", "certain" if sure else "likely", what, remedy, tuple(worth))
+    yield Finding("fault" if spoils else "warning", what, remedy, tuple(worth))
 
 
 def _sentence(view: str, fits: Sequence[Fit], scale: float) -> str:
@@ -102,7 +101,7 @@ def _shape(fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
     usual = float(np.median(list(aligned.values())))
     if usual < _SHAPE:
         yield Finding(
-            "warning", "likely",
+            "warning",
             f"Even at the best shift the rest scene's silhouettes overlap those of frame 0 by {usual:.2f} only: parts "
             "are missing in the scene, or frame 0 shows another shape.",
             "Look at views.png (--out DIR). Reconstruct the scene again, or check the masks and that sequences begin "
@@ -125,7 +124,7 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
             "the cameras again (`gausim prepare poses`)."
         )
     return Finding(
-        "fault", "certain" if fits else "likely",
+        "fault",
         f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f}). {what}",
         remedy,
     )  # fmt: skip

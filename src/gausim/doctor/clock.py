@@ -18,9 +18,8 @@ FURTHEST = 8
 _REACHED, _GAIN = 0.5, 0.25
 _REACHED_ALONE, _GAIN_ALONE = 0.65, 0.5
 # The energy's phase depends on the view where the object moves in a circle, so the centres of the masks have equal
-# weight if their correlation reaches this. Otherwise the energy alone must reach, and gain, the values after it.
+# weight if their correlation reaches this. Otherwise the shift is undetermined.
 _TELLING = 0.5
-_REACHED_BY_ITSELF, _GAIN_BY_ITSELF = 0.8, 0.6
 # Overlap with the rest scene below which a camera's pose is not used.
 _SOMEWHERE = 0.5
 # Correlation with the other cameras' motion below which a camera's shift is undetermined.
@@ -47,23 +46,23 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
         return
     if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
         yield Finding(
-            "note", "certain", "Whether the cameras are in step was not looked at: their poses are wrong.",
+            "note", "Whether the cameras are in step was not looked at: their poses are wrong.",
             "Mend the calibration and run this again.",
         )  # fmt: skip
         return
-    lags, unsure, guessed = _lags(series, _REACHED, _GAIN)
+    lags, unsure = _lags(series, _REACHED, _GAIN)
     for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
-            "note", "possible",
+            "note",
             f"Whether {view} is in step with the other cameras cannot be told: its motion over time is unlike theirs.",
             "Compare it by eye in motion.png (--out DIR).", (view,),
         )  # fmt: skip
     if any(lags.values()):
-        yield from _findings(evidence, lags, guessed, [s.name for s in series])
+        yield from _findings(evidence, lags, [s.name for s in series])
         return
     for one in series:
-        lags, _, guessed = _lags([one], _REACHED_ALONE, _GAIN_ALONE)
-        yield from _findings(evidence, lags, guessed, [one.name])
+        lags, _ = _lags([one], _REACHED_ALONE, _GAIN_ALONE)
+        yield from _findings(evidence, lags, [one.name])
 
 
 def motion_energy(item: Watched) -> np.ndarray:
@@ -134,8 +133,8 @@ def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:
     return lenses @ projection @ rotations
 
 
-def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[int, int], set[int], set[int]]:
-    """Delay of each view [frames], the undetermined views, and the views determined by energy alone.
+def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[int, int], set[int]]:
+    """Delay of each view [frames], and the undetermined views.
 
     Views are shifted in the order of their gain, the largest first.
     """
@@ -143,7 +142,6 @@ def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[
     lags: dict[int, int] = dict.fromkeys(range(views), 0)
     settled: set[int] = set()
     unsure: set[int] = set()
-    guessed: set[int] = set()
     while len(settled) < views - (views == 2):
         scores = {v: _score(series, v, lags) for v in range(views) if v not in settled}
         gains = {v: float(c.max() - c[FURTHEST]) for v, (c, _) in scores.items() if c.max() >= reached}
@@ -152,13 +150,12 @@ def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[
             break
         curve, telling = scores[best]
         settled.add(best)
-        if telling or (curve.max() >= _REACHED_BY_ITSELF and gains[best] >= _GAIN_BY_ITSELF):
+        if telling:
             lags[best] = int(curve.argmax()) - FURTHEST
-            guessed |= set() if telling else {best}
         else:
             unsure.add(best)
     unlike = {v for v in range(views) if v not in settled and _energy_correlation(series, v, lags).max() < _UNLIKE}
-    return lags, unsure | unlike, guessed
+    return lags, unsure | unlike
 
 
 def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[np.ndarray, bool]:
@@ -167,7 +164,7 @@ def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[
     return ((energy + path) / 2, True) if path.max() >= _TELLING else (energy, False)
 
 
-def _findings(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences: list[str]) -> Iterator[Finding]:
+def _findings(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Iterator[Finding]:
     place = f"in {sequences[0]}" if len(sequences) == 1 else f"in all {len(sequences)} sequences that were looked at"
     for v, lag in lags.items():
         if lag == 0:
@@ -179,7 +176,7 @@ def _findings(evidence: Evidence, lags: dict[int, int], guessed: set[int], seque
             f"or give {view} back the {frames} that were cut from its start"
         )  # fmt: skip
         yield Finding(
-            "warning" if v in guessed else "fault", "possible" if v in guessed else "likely",
+            "fault",
             f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
             f"{place}.",
             f"Number the frames again: {cut}, and cut all cameras to one length. With films: `gausim "

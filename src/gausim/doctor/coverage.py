@@ -19,8 +19,8 @@ _OFTEN = 0.2
 # An object is tiny below this fraction of the picture's longer side, or this many of its pixels.
 _TINY_FRACTION, _TINY_PIXELS = 0.12, 24
 
-# The paper's number of seen frames, and the smallest number from which motion can be learned.
-_SEEN, _FEWEST_SEEN = 16, 6
+# The paper's number of seen frames.
+_SEEN = 16
 # Smallest number of sequences with enough directions of motion.
 _SEQUENCES = 4
 # Fraction of pinned kernels above which little of a scene can move.
@@ -56,13 +56,13 @@ def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
     angle = seen_angle(directions)
     if len(names) == 1:
         yield Finding(
-            "fault", "certain",
+            "fault",
             f"There is one training view only ({names[0]}): motion towards it and away from it is not seen.",
             "Film with at least two cameras, better four, 40 degrees or more apart.",
         )  # fmt: skip
     elif angle < _NARROW:
         yield Finding(
-            "fault" if angle < _SAME else "warning", "certain",
+            "fault" if angle < _SAME else "warning",
             f"The training views {listed(names)} look along nearly the same line ({angle:.0f} degrees): depth is "
             "hardly seen.",
             "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
@@ -80,7 +80,7 @@ def find_cut_off(evidence: Evidence) -> Iterator[Finding]:
             continue
         moves = any(bool((sides[side] != sides[side][:1]).any()) for side in cut)
         yield Finding(
-            "warning", "likely" if moves else "possible",
+            "warning",
             f"The object is cut off at the {listed(cut)} of {view} in {max(often.values()):.0%} of the frames"
             f"{'' if moves else ', where nothing moves'}.",
             "Move the camera back or turn it. Where only a part that is held leaves the picture, this does no harm.",
@@ -100,7 +100,7 @@ def find_tiny(evidence: Evidence) -> Iterator[Finding]:
         length, longer = float(np.median(lengths)), max(evidence.first[0].alpha.shape[-2:])
         if length < _TINY_FRACTION * longer or length / evidence.scale < _TINY_PIXELS:
             yield Finding(
-                "warning", "certain",
+                "warning",
                 f"The object is tiny in {view}: {length / evidence.scale:.0f} pixels, {length / longer:.0%} of the "
                 "picture's longer side.",
                 "Film from nearer or with a longer lens, or crop the pictures (and shift cx, cy, w and h with them).",
@@ -117,14 +117,14 @@ def find_pins(evidence: Evidence) -> Iterator[Finding]:
     except SceneError as error:
         sentence, _, remedy = str(error).partition(". ")
         yield Finding(
-            "fault", "certain", f"{sentence.rstrip('.')}.",
+            "fault", f"{sentence.rstrip('.')}.",
             remedy or "Pin fewer kernels, e.g. --pin \"below z=...\" with a lower height.",
         )  # fmt: skip
         return
     fraction = float(scene.pinned.sum()) / float(scene.simulated.sum())
     if fraction > _MOSTLY_PINNED:
         yield Finding(
-            "warning", "possible",
+            "warning",
             f"{fraction:.0%} of the simulated kernels are pinned: hardly anything is left to move.",
             "Pin only what is held in the videos (`gausim inspect SCENE.ply` draws it in grey).",
         )  # fmt: skip
@@ -135,14 +135,14 @@ def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
     seen, sequences = len(evidence.data.train_frames), evidence.sequences
     if seen < _SEEN:
         yield Finding(
-            "warning", "likely" if seen < _FEWEST_SEEN else "possible",
+            "warning",
             f"Training sees {seen} frames of each sequence only (field 'train_frames' of dataset.json); the paper sees "
             f"{_SEEN}. Less than a swing says little about stiffness and damping.",
             f"Record longer sequences, or set 'train_frames' to [0, {_SEEN}].",
         )  # fmt: skip
     if sequences < _SEQUENCES:
         yield Finding(
-            "warning", "possible",
+            "warning",
             f"Sequences: {sequences} only. Pushes in directions that were never filmed will be predicted badly.",
             "Record more, pushed at different places and in different directions (the paper has 30).",
         )  # fmt: skip

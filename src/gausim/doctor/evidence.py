@@ -18,7 +18,6 @@ from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_si
 from gausim.runs.bar import with_bar
 
 Severity = Literal["fault", "warning", "note"]
-Sureness = Literal["certain", "likely", "possible"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 
 # Sequences whose motion is examined, and whose first frames are compared with the rest scene.
@@ -34,7 +33,6 @@ class Finding:
     """One finding."""
 
     severity: Severity  # "fault" if it makes training useless, "warning" if it lowers the quality, else "note"
-    sureness: Sureness  # certainty of the finding
     what: str  # the problem, in a sentence that names cameras, sequences and files
     remedy: str  # what to do
     views: tuple[str, ...] = ()  # cameras that a fault of calibration or clock is about

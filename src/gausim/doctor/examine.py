@@ -19,7 +19,7 @@ CHECKS = (
     ("views", ("masks", "calibration"), (coverage.find_like_directions, coverage.find_cut_off, coverage.find_tiny)),
     ("clock", ("masks",), (clock.find_clock_faults,)),
     ("motion", ("masks",), (motion.find_unrest, motion.find_odd_motion)),
-    ("appearance", ("masks", "calibration"), (appearance.find_plain, appearance.find_flicker, appearance.find_uneven)),
+    ("appearance", ("masks", "calibration"), (appearance.find_flicker, appearance.find_uneven)),
 )
 
 
@@ -48,7 +48,7 @@ def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
         evidence = gather(data, scene)
     except DataError as error:
         remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
-        return Examination((Finding("fault", "certain", str(error), remedy, check="files"),), {}, None)
+        return Examination((Finding("fault", str(error), remedy, check="files"),), {}, None)
     findings: list[Finding] = []
     left_out: dict[str, str] = {}
     for name, needs, finders in with_bar(CHECKS, "checks"):

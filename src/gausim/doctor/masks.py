@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from gausim.doctor.evidence import Evidence, Finding, listed
-from gausim.doctor.silhouettes import overlap
 
 # Fractions of foreground along the image border above which masks are inverted, and missing.
 _AROUND, _EVERYWHERE = 0.8, 0.999
@@ -45,17 +44,10 @@ def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
     covered = float(np.mean([(item.alpha[0, index] > 127).mean() for item in evidence.first]))
     if covered > _EVERYWHERE:
         return _not_cut_out(evidence, views, index)
-    proof, sure = "", False
-    if evidence.rest is not None:
-        pairs = [(item.alpha[0, v] / np.float32(255), rest.alpha[v])
-                 for item, rest in zip(evidence.first, evidence.rest, strict=True) for v in index]  # fmt: skip
-        fits, inverted = (float(np.mean([overlap(abs(sign - a), b) for a, b in pairs])) for sign in (0, 1))
-        sure = inverted > fits + 0.3
-        proof = f" Inverted, they would overlap the rest scene's silhouettes by {inverted:.2f} instead of {fits:.2f}."
     return Finding(
-        "fault", "certain" if sure else "likely",
-        f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle."
-        f"{proof if sure else ''}", "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
+        "fault",
+        f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle.",
+        "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
     )  # fmt: skip
 
 
@@ -65,7 +57,7 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
     hue = float(np.median([np.ptp(rim.mean(0)) for rim in rims]))
     backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background or --backend masks"
     return Finding(
-        "fault", "certain",
+        "fault",
         f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background would be taken "
         "for the object.", f"Make masks: `gausim prepare segment PICTURES --out OUT --backend {backend}`.",
     )  # fmt: skip
@@ -81,7 +73,7 @@ def _empty(evidence: Evidence) -> Iterator[Finding]:
             continue
         told = "never shows the object" if empty == 1 else f"does not show the object in {empty:.0%} of the frames"
         yield Finding(
-            "fault" if empty > _MANY else "warning", "certain",
+            "fault" if empty > _MANY else "warning",
             f"{view} {told}: the mask is empty (first: {first}).",
             f"Segment {view} again; where it does not see the object, take it out of dataset.json (field 'views').",
         )  # fmt: skip
@@ -99,7 +91,7 @@ def _haze(evidence: Evidence) -> Iterator[Finding]:
     hazy = [view for view, fraction in fractions.items() if fraction > _HAZE]
     if hazy:
         yield Finding(
-            "warning", "certain",
+            "warning",
             f"A haze of faint alpha (1 to {_FAINT} of 255) lies around the object in {listed(hazy)}, over up to "
             f"{max(fractions.values()):.0%} of the picture. All alpha above 0 counts as foreground.",
             "Set alpha below 0.1 to 0 in the images, or segment again with `--floor 0.1`.",
@@ -119,7 +111,7 @@ def _blinking(evidence: Evidence) -> Iterator[Finding]:
             jumps += [f"{item.name} frame {f}" for f in np.nonzero(off)[0] if area[f] > 0]
         if jumps:
             yield Finding(
-                "warning", "likely",
+                "warning",
                 f"The mask of {view} jumps in size by more than {_JUMP:.0%} for a frame or two: {listed(jumps)}.",
                 "Look at these frames; segment them again (`--radius 3` mends what flashes up or drops out).",
             )  # fmt: skip

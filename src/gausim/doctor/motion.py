@@ -40,7 +40,7 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
     largest = {name: float(d.max()) for name, d in moving.items()}
     if max(largest.values()) < _STILL:
         yield Finding(
-            "fault", "certain",
+            "fault",
             f"Nothing moves: no part of the object leaves its place by more than {max(largest.values()):.2f} pixels in "
             f"any of {len(moving)} sequences.",
             "Record sequences in which the object is set off, or check that the frames are not one picture repeated.",
@@ -49,13 +49,13 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
     still = [name for name, pixels in largest.items() if pixels < _STILL]
     if still:
         yield Finding(
-            "warning", "certain", f"Nothing moves in {listed(still)}.",
+            "warning", f"Nothing moves in {listed(still)}.",
             "Leave these sequences out; they teach nothing.",
         )  # fmt: skip
     typical = float(np.median([p for p in largest.values() if p >= _STILL]))
     if typical < _SMALL:
         yield Finding(
-            "warning", "likely",
+            "warning",
             f"The motion is smaller than a pixel (at most {typical:.2f} pixels): noise and the edges of the masks are "
             "as large.",
             "Push harder, film from nearer, or at a higher resolution.",
@@ -64,7 +64,7 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
         here = max(float(d[:, v].max()) for d in moving.values())
         if here < _STILL and len(evidence.views) > 1:
             yield Finding(
-                "fault", "likely",
+                "fault",
                 f"{view} shows no motion (at most {here:.2f} pixels), while others show {typical:.1f}: it may be one "
                 "picture repeated.", f"Export the frames of {view} again, or take it out of dataset.json.",
             )  # fmt: skip
@@ -97,7 +97,7 @@ def find_unrest(evidence: Evidence) -> Iterator[Finding]:
     worst = min(off.values())
     against = "those of the other sequences" if evidence.fits is None else "the rest scene and other sequences"
     yield Finding(
-        "fault" if worst < _FAR_FROM_REST else "warning", "likely",
+        "fault" if worst < _FAR_FROM_REST else "warning",
         f"Frame 0 is not at rest in {listed(list(off))}: its silhouettes overlap {against} by {worst:.2f} only. A "
         "prediction starts from the rest scene, so it would begin at the wrong place.",
         "Begin each sequence at the last frame before the object is set off, or leave the sequence out.",
@@ -159,7 +159,7 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     rate = f"The object swings at about {dominant:.2g} Hz at {fps:g} frames per second"
     if swings and pace > _FAST:
         yield Finding(
-            "fault" if pace > _TOO_FAST else "warning", "likely",
+            "fault" if pace > _TOO_FAST else "warning",
             f"{rate}, once in {1 / pace:.1f} frames: that is too fast for steps of a frame.",
             "Film at a higher rate (five frames per swing or more), or keep every frame of the film.",
         )  # fmt: skip
@@ -168,7 +168,7 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     if not (usual and plausible):
         reason = f"{fps:g} frames per second is no usual rate of a camera. " if not usual else ""
         yield Finding(
-            "warning", "possible" if plausible else "likely",
+            "warning",
             f"{reason}{f'{rate}. ' if swings else ''}Field 'fps' of dataset.json may be wrong. Velocities, stiffness "
             "and damping scale with it.",
             "Set 'fps' in dataset.json and every sequences/*/transforms.json to the rate of the frames that are there "
@@ -176,6 +176,6 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
     elif swings:
         yield Finding(
-            "note", "likely", f"{rate}.",
+            "note", f"{rate}.",
             "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.",
         )  # fmt: skip

@@ -18,16 +18,15 @@ _BEHIND = 90
 _OUTLINE = "#f0962a"
 
 
-def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
-    """Writes all pictures to a folder; returns name and caption of each."""
+def draw_pictures(evidence: Evidence, out: Path) -> None:
+    """Writes ``views.png`` and ``motion.png`` to a folder.
+
+    The first has frame 0 of the first sequence in every view; the orange outline is that of the rest scene, drawn by
+    the camera that the file states, and must lie on the object. The second has the change from frame to frame within
+    the foreground, as a fraction of each camera's largest; onset and peaks must lie above each other in all cameras.
+    """
     for name, draw in with_bar((("views.png", _views), ("motion.png", _motion)), "pictures"):
         save_figure(literal(draw(evidence)), out / name)
-    return [
-        ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
-         "camera that the file states. Both must lie on each other."),
-        ("motion.png", "Change from frame to frame within the foreground, as a fraction of each camera's largest. "
-         "Onset and peaks must lie above each other in all cameras."),
-    ]  # fmt: skip
 
 
 def _views(evidence: Evidence) -> Figure:

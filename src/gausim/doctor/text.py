@@ -1,15 +1,10 @@
-"""Output of findings: text, plain data, and an HTML page with pictures."""
+"""Output of findings: text and plain data."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.resources import files
-from pathlib import Path
 from typing import Any
-
-from jinja2 import Environment, StrictUndefined
 
 from gausim.doctor.evidence import SEVERITIES, listed
 from gausim.doctor.examine import Examination
@@ -21,7 +16,7 @@ def findings_text(root: str, found: Examination) -> str:
     """All findings of an object, for a terminal."""
     lines = [f"{root}: {summary_line(found)}"]
     for finding in found.findings:
-        head = f"  {finding.severity.upper()}  {finding.check} ({finding.sureness}): {finding.what}"
+        head = f"  {finding.severity.upper()}  {finding.check}: {finding.what}"
         lines += textwrap.wrap(head, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
         lines += textwrap.wrap(f"Remedy: {finding.remedy}", _WIDTH, initial_indent="    ", subsequent_indent="    ",
                                break_long_words=False, break_on_hyphens=False)  # fmt: skip
@@ -50,21 +45,3 @@ def summary_line(found: Examination) -> str:
 def plain_findings(found: Examination) -> dict[str, Any]:
     """Findings and omitted checks as plain data for JSON."""
     return {"findings": [asdict(finding) for finding in found.findings], "left_out": found.left_out}
-
-
-def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str]]) -> None:
-    """Writes the HTML page beside the ``pictures``, pairs of file name and caption.
-
-    Names are escaped, and the page's security policy forbids the browser to load anything from elsewhere.
-    """
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    template = environment.from_string(files("gausim.doctor").joinpath("page.html").read_text(encoding="utf-8"))
-    assert found.evidence is not None
-    text = template.render(
-        name=found.evidence.data.name,
-        summary=summary_line(found),
-        findings=found.findings,
-        left_out=found.left_out,
-        pictures=pictures,
-    )
-    path.write_text(text, encoding="utf-8")
