@@ -75,7 +75,9 @@ def build(node: Any) -> None:
         build(child)
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize(
+    "option", [pytest.param(o, marks=[pytest.mark.slow] * (o == "logger=mlflow")) for o in OPTIONS]
+)
 def test_option_composes_fits_the_signatures_and_builds(option: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "disabled")
     config = compose([option])

@@ -48,10 +48,10 @@ def test_it_is_the_growth_of_a_small_motion(monkeypatch: pytest.MonkeyPatch) -> 
     model.eval()
     draw = torch.randn(batch.rest.shape, generator=torch.Generator().manual_seed(0))
     state = SimState(batch.rest, batch.rest + 1e-4 * draw)
-    logs, small = [], 1e-4
+    logs, small, prepared = [], 1e-4, model.prepare(batch)
     with torch.no_grad():
         for _ in range(300):
-            after = model.step(batch, state).positions
+            after = model.step(batch, state, prepared=prepared).positions
             factor = small / float(torch.stack((after - batch.rest, state.positions - batch.rest)).abs().max())
             state = SimState(
                 batch.rest + factor * (after - batch.rest), batch.rest + factor * (state.positions - batch.rest)

@@ -190,6 +190,7 @@ def test_a_fit_to_the_truth_has_no_error_and_keeps_the_order_of_stiffness() -> N
     assert summary([replace(x, fitted_period=-x.period) for x in found]).stiffness == pytest.approx(-1.0)
 
 
+@pytest.mark.slow
 def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus: Path) -> None:
     torch.manual_seed(0)
     module, data = pretraining(corpus, "experiment=pretrain_fit", "init_from=RUN", "data.seen=8")

@@ -29,7 +29,14 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_toy_object(tmp_path_factory.mktemp("warm") / "toy", frames=8).root
 
 
-@pytest.mark.parametrize("choice", [["model=gausim"], ["model=gausim_elastic"], ["model=gausim", "supervision=points"]])
+@pytest.mark.parametrize(
+    "choice",
+    [
+        ["model=gausim"],
+        pytest.param(["model=gausim_elastic"], marks=pytest.mark.slow),
+        pytest.param(["model=gausim", "supervision=points"], marks=pytest.mark.slow),
+    ],
+)
 def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_checkpoint(
     toy: Path, tmp_path: Path, choice: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
