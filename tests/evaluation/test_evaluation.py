@@ -15,7 +15,7 @@ from gausim.results.pivot import Pivot
 from gausim.results.summary import FLOOR
 from gausim.results.table import load_results
 
-LINEAR = "linear AR(2) on true states, 8 modes"
+LINEAR, MEMORY = "linear AR(2) on true states, 8 modes", "linear AR(4) on true states"
 
 
 pytestmark = pytest.mark.usefixtures("quick_evaluations")
@@ -53,7 +53,7 @@ def number(evaluated):
 def test_shapes_of_the_curves(evaluated):
     assert evaluated.values["oracle"]["l2"].shape == (2, 20, 3)
     assert evaluated.values["oracle"]["error_3d"].shape == (2, 20)
-    assert set(evaluated.rows) == {"oracle", "half", "still", "static", LINEAR, LINEAR.replace("8", "24")}
+    assert set(evaluated.rows) == {"oracle", "half", "still", "static", LINEAR, LINEAR.replace("8", "24"), MEMORY}
     finite = [np.isfinite(v[:, 1:]).all() for row in evaluated.values.values() for v in row.values()]
     assert all(finite) and len(finite) > 20
 

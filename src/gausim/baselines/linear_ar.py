@@ -1,11 +1,13 @@
-"""Linear AR(2) on principal modes of the true 3D states: a reference row, not a method.
+"""Linear AR(p) on principal modes of the true 3D states: reference rows, not methods.
 
-It uses data that no method has (the true positions, also of the first two frames), but no physics, images or network:
-linear elasticity in few modes, fitted by least squares. A method that predicts worse than this has learned little.
+They use data that no method has (the true positions, also of the first p frames), but no physics, images or network:
+linear elasticity in few modes, fitted by least squares. A method that predicts worse than this has learned little. Two
+frames are the state of an elastic body of which the modes show everything; four remember what they do not show.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,44 +17,92 @@ from torch import Tensor
 
 from gausim.core import DataError
 
+# Ridges among which one is chosen on the seen frames [mean squares of the coordinates].
+RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+
 
 @dataclass(frozen=True, eq=False)
-class LinearAR2:
-    """q_{t+1} = A q_t + B q_{t-1} with q the coordinates of the displacement in M orthonormal modes."""
+class LinearAR:
+    """q_t = sum_k A_k q_{t-k} with q the coordinates of the displacement in M orthonormal modes."""
 
     modes: Float[Tensor, "M P 3"]  # orthonormal modes of the displacement of P points
-    first: Float[Tensor, "M M"]  # A
-    second: Float[Tensor, "M M"]  # B
+    coefficients: Float[Tensor, "p M M"]  # A_1, ..., A_p
 
-    def rollout(self, displacement: Float[Tensor, "2 P 3"], steps: int) -> Float[Tensor, "F P 3"]:
-        """Predicts ``steps`` frames after frame 0 from the displacements in frames 0 and 1, which come first."""
+    @property
+    def order(self) -> int:
+        """The number p of frames from which a rollout starts."""
+        return len(self.coefficients)
+
+    def rollout(self, displacement: Float[Tensor, "p P 3"], steps: int) -> Float[Tensor, "F P 3"]:
+        """Predicts ``steps`` frames after frame 0 from the displacements in the first p frames, which come first."""
         modes = self.modes.flatten(1)
-        q = [x for x in displacement.to(modes).flatten(1) @ modes.T]
-        for _ in range(steps - 1):
-            q.append(self.first @ q[-1] + self.second @ q[-2])
-        predicted = torch.stack(q[: steps + 1]) @ modes
-        return predicted.reshape(-1, *displacement.shape[1:]).to(displacement)
+        q = continued(self.coefficients, displacement.to(modes).flatten(1) @ modes.T, steps + 1)
+        return (q @ modes).reshape(-1, *displacement.shape[1:]).to(displacement)
 
 
-def fit_linear_ar2(displacements: Sequence[Float[Tensor, "F P 3"]], n_modes: int) -> LinearAR2:
-    """Fits at most ``n_modes`` modes and coefficients to the seen frames of all sequences by least squares, in float64.
+def continued(coefficients: Float[Tensor, "p M M"], begun: Float[Tensor, "p M"], frames: int) -> Float[Tensor, "F M"]:
+    """Coordinates of so many frames, of which the first p are given."""
+    q = list(begun)
+    while len(q) < frames:
+        q.append(sum((a @ q[-k] for k, a in enumerate(coefficients, 1)), torch.zeros_like(q[0])))
+    return torch.stack(q[:frames])
+
+
+def fit_linear_ar(
+    displacements: Sequence[Float[Tensor, "F P 3"]], n_modes: int, order: int = 2, *, ridge: float = 0.0
+) -> LinearAR:
+    """Fits at most ``n_modes`` modes and coefficients to the seen frames of all sequences, in float64.
 
     The modes are those of the displacements from rest [scene units] themselves, not of their deviation from a mean:
     the rest state is the equilibrium. Where the motion has fewer modes than requested, the others are 0 (least-norm
-    solution).
+    solution). ``ridge`` is the weight of the squared coefficients, in mean squares of the coordinates times the number
+    of transitions.
 
     Raises:
-        DataError: there is no sequence, or one has fewer than three frames.
+        DataError: there is no sequence, or one has not more than ``order`` frames.
     """
-    if not displacements or any(len(d) < 3 for d in displacements):
-        raise DataError("linear AR(2): expected at least one sequence with at least three seen frames in each.")
+    if not displacements or any(len(d) <= order for d in displacements):
+        raise DataError(
+            f"linear AR({order}): expected at least one sequence, with at least {order + 1} seen frames in each."
+        )
+    modes, coordinates = _coordinates(displacements, n_modes)
+    return LinearAR(modes.reshape(-1, *displacements[0].shape[1:]), _fitted(coordinates, order, ridge))
+
+
+def choose_linear_ar(displacements: Sequence[Float[Tensor, "F P 3"]], sizes: Sequence[int], order: int) -> LinearAR:
+    """Of several numbers of modes and :data:`RIDGES` those that predict a sequence best that was left out.
+
+    Of a single sequence the first two thirds of its frames predict all.
+
+    Raises:
+        DataError: as :func:`fit_linear_ar`.
+    """
+    least, chosen = float("inf"), (sizes[0], RIDGES[0])
+    for n_modes, ridge in itertools.product(sizes, RIDGES):
+        error = 0.0
+        for number, own in enumerate(displacements):
+            part = own[: max(order + 1, 2 * len(own) // 3)]
+            others = [*displacements[:number], *displacements[number + 1 :]] or [part]
+            made = fit_linear_ar(others, n_modes, order, ridge=ridge).rollout(own[:order], len(own) - 1)
+            error += float((made - own).square().mean())
+        if error < least:
+            least, chosen = error, (n_modes, ridge)
+    return fit_linear_ar(displacements, chosen[0], order, ridge=chosen[1])
+
+
+def _coordinates(displacements: Sequence[Tensor], n_modes: int) -> tuple[Tensor, list[Tensor]]:
     rows = [d.double().flatten(1) for d in displacements]
     _, _, modes = torch.linalg.svd(torch.cat(rows), full_matrices=False)
-    modes = modes[:n_modes]
-    coordinates = [r @ modes.T for r in rows]
-    now_and_before = torch.cat([torch.cat((q[1:-1], q[:-2]), 1) for q in coordinates])
-    following = torch.cat([q[2:] for q in coordinates])
+    return modes[:n_modes], [row @ modes[:n_modes].T for row in rows]
+
+
+def _fitted(coordinates: Sequence[Tensor], order: int, ridge: float) -> Float[Tensor, "p M M"]:
+    known = torch.cat([torch.cat([q[order - k : len(q) - k] for k in range(1, order + 1)], 1) for q in coordinates])
+    following = torch.cat([q[order:] for q in coordinates])
+    if ridge:
+        weight = (ridge * known.square().mean() * len(known)).sqrt()
+        known = torch.cat((known, weight * torch.eye(known.shape[1]).to(known)))
+        following = torch.cat((following, following.new_zeros(known.shape[1], following.shape[1])))
     # gelsd gives the least-norm solution also where modes are empty or transitions are few.
-    solution = torch.linalg.lstsq(now_and_before, following, driver="gelsd").solution.T
-    m = len(modes)
-    return LinearAR2(modes.reshape(m, *displacements[0].shape[1:]), solution[:, :m], solution[:, m:])
+    solution = torch.linalg.lstsq(known, following, driver="gelsd").solution.T
+    return torch.stack(solution.chunk(order, 1))

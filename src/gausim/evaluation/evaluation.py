@@ -1,7 +1,7 @@
 """Evaluation of predictions of an object against its videos and, where known, its true 3D motion.
 
 It needs no run: any callable that returns a :class:`Trajectory` of a sequence can be evaluated beside the references
-(a prediction without dynamics, linear AR(2) on the true states). Frames are processed in chunks; per-frame figures are
+(a prediction without dynamics, linear AR(p) on the true states). Frames are processed in chunks; per-frame figures are
 kept.
 """
 
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim import metrics
-from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
+from gausim.baselines.linear_ar import LinearAR, choose_linear_ar, fit_linear_ar
 from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, Trajectory
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
@@ -57,8 +57,8 @@ from gausim.training.supervision.points import attach_points
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
-# Modes of the linear references: few for robustness, more for finer motion.
-AR_MODES = (8, 24)
+# Modes of the linear references: few for robustness, more for finer motion. Frames that the last one remembers.
+AR_MODES, AR_MEMORY = (8, 24), 4
 MASK_IOU = ImageMetricInfo(IOU, "mask IoU", 1.0, "", higher_is_better=True)
 # Pixels that are rendered and compared at once: about 100 MB of float images and their filters.
 PIXELS_AT_ONCE = 1 << 20
@@ -94,7 +94,7 @@ class _Task:
     reference: Reference
     look: SceneAppearance
     attached: Tensor | None  # the kernel of every true point
-    linear: dict[str, LinearAR2]
+    linear: dict[str, LinearAR]
 
 
 class _Totals:
@@ -212,14 +212,17 @@ def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecor
     return data.sequences if names is None else [known[n] for n in names]
 
 
-def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
-    """Linear AR(2) about the rest state, fitted to the seen frames of every sequence whose truth is known."""
+def _linear_references(data: ObjectData) -> dict[str, LinearAR]:
+    """Linear AR(2) and AR(4) about the rest state, fitted to the seen frames of every sequence whose truth is known."""
     shown = [record for record in data.sequences if record.limit is None]
     truths = [t for t in (data.ground_truth(record) for record in shown) if t is not None]
     seen = [(t.positions - t.rest)[: data.train_frames.stop] for t in truths]
     if not seen or min(len(d) for d in seen) < 3:
         return {}
-    return {f"linear AR(2) on true states, {m} modes": fit_linear_ar2(seen, m) for m in AR_MODES}
+    found = {f"linear AR(2) on true states, {m} modes": fit_linear_ar(seen, m) for m in AR_MODES}
+    if min(len(d) for d in seen) > AR_MEMORY:
+        found[f"linear AR({AR_MEMORY}) on true states"] = choose_linear_ar(seen, AR_MODES, AR_MEMORY)
+    return found
 
 
 @torch.no_grad()
@@ -314,7 +317,7 @@ def _points(
     }
     displacement = truth.positions - truth.rest
     for name, linear in task.linear.items():
-        predicted[name] = truth.rest + linear.rollout(displacement[:2], len(truth.positions) - 1)
+        predicted[name] = truth.rest + linear.rollout(displacement[: linear.order], len(truth.positions) - 1)
     moving = {name: points for name, points in predicted.items() if name != task.reference.name}
     units = {name: [unit.cpu()[attached] for unit in found] for name, found in _told(task, "units").items() if found}
     totals.diagnosis.add(truth.positions, truth.rest, moving, units)
