@@ -10,7 +10,6 @@ from helpers.bodies import make_model, make_scene
 from helpers.sway import real_module, sample
 from torch import Tensor
 
-from gausim.core import ConfigError
 from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
 from gausim.models.template import solid
 from gausim.models.template.elastic import ElasticTemplate
@@ -74,9 +73,15 @@ def test_only_vibrations_may_have_velocities(model, monkeypatch: pytest.MonkeyPa
     torch.testing.assert_close(some.motion(0), every.motion(0))
 
 
-def test_template_without_a_basis_is_refused() -> None:
-    with pytest.raises(ConfigError, match="RestTemplate carries no basis.*FreeInitialStates"):
-        ModalInitialStates(make_model(make_scene(40)), [0])
+def test_a_rest_template_has_the_modes_of_an_even_solid() -> None:
+    simulator = make_model(make_scene(40))
+    motions, free = simulator.smooth_motions(0), simulator.scenes[0].simulated & ~simulator.scenes[0].pinned
+    assert motions.count == len(motions.sizes) and bool((motions.kernels[~free] == 0).all())
+    assert bool((motions.kernels[free].norm(dim=(0, 1)) > 0).all()) and bool((motions.sizes.diff() <= 0).all())
+    initial = ModalInitialStates(simulator, [0])
+    shown = 0.3 * motions.kernels[..., 0]
+    initial.set_motion(0, shown)
+    torch.testing.assert_close(initial.motion(0).float(), shown, atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

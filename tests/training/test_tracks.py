@@ -13,7 +13,7 @@ from helpers import sway, toy_object
 from helpers.simulators import gausim
 from torch import Tensor
 
-from gausim.core import ConfigError, Frame, GaussianScene, HandPath, SmoothMotions
+from gausim.core import Frame, GaussianScene, HandPath, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.losses import ImageLoss
 from gausim.models.initial_state import ModalInitialStates
@@ -163,8 +163,3 @@ def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
     checkpoint: dict[str, object] = {}
     module.on_save_checkpoint(checkpoint)
     assert checkpoint["gausim"]["tracks"][0].shape == (FRAMES, MODES)
-
-
-def test_a_model_without_smooth_motions_is_refused(sources: Sources) -> None:
-    with pytest.raises(ConfigError, match="this model has none. Use supervision=images"):
-        TrackSupervision(replace(sources, motions=small(SCENE).smooth_motions))

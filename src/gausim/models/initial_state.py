@@ -140,7 +140,7 @@ class ModalInitialStates(InitialStates):
         """Creates one parameter per sequence, initially zero.
 
         Args:
-            model: its template must have a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
+            model: the simulator, of whose template the modes are.
             scene_of_sequence: index of the scene of each sequence.
             vibrations: only these have a velocity. Modal derivatives only follow them; with velocities of their own
                 they would swing on, far above the frame rate. False for runs that have velocities of all modes.
@@ -151,11 +151,6 @@ class ModalInitialStates(InitialStates):
         self._basis = []
         for scene_id, diagonal in enumerate(self._diagonal):
             motions = model.smooth_motions(scene_id)
-            if motions is None:
-                raise ConfigError(
-                    f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
-                    "Use gausim.models.initial_state.FreeInitialStates with it."
-                )
             moving = model.template.vibrations(scene_id) if vibrations else None
             basis = (motions.kernels / motions.sizes)[..., :moving]
             most = basis.norm(dim=1).amax(0).clamp_min(TINY)

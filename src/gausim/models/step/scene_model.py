@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -154,9 +155,9 @@ class SceneModel(nn.Module, ABC):
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
         shift = shift.masked_fill(batch.pinned[:, None], 0.0)
         if not self.knows_energy:
-            return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
+            return replace(state, positions=state.positions.index_add(0, batch.simulated, shift))
         gained = (2 * shift - prepared.overshoot(state, 2 * shift)).masked_fill(batch.pinned[:, None], 0.0)
-        return SimState(state.positions, state.previous.index_add(0, batch.simulated, gained, alpha=-1))
+        return replace(state, previous=state.previous.index_add(0, batch.simulated, gained, alpha=-1))
 
     @property
     def knows_energy(self) -> bool:
@@ -180,14 +181,12 @@ class SceneModel(nn.Module, ABC):
         """Mode mixing of the template of a scene (:meth:`Template.mixing`); None where it has none."""
         return self.template.mixing(scene_id)
 
-    def smooth_motions(self, scene_id: int) -> SmoothMotions | None:
-        """The template's modes at every kernel of a scene; None for templates without modes.
+    def smooth_motions(self, scene_id: int) -> SmoothMotions:
+        """The template's modes at every kernel of a scene.
 
         A kernel moves by the displacement of its unit plus the unit's displacement gradient times its offset.
         """
         motions = self.template.basis(scene_id)
-        if motions is None:
-            return None
         scene, hierarchy, finest = self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1]
         modes, slopes, sizes = (x.to(scene.means) for x in motions)  # where the scenes are
         axes = self.axes[scene_id].to(modes)
@@ -242,11 +241,6 @@ class SceneModel(nn.Module, ABC):
             "template": [p for name, p in named.items() if name.startswith(shared)],
             "matrices": [p for name, p in named.items() if not name.startswith(shared)],
         }
-
-    @property
-    def shared_groups(self) -> tuple[str, ...]:
-        """Those of :meth:`parameter_groups` that all scenes have in common."""
-        return "network", "template"
 
     def shared(self) -> tuple[str, ...]:
         """Prefixes of the names of what all scenes have in common: predictor, statistics of its inputs, decoders."""

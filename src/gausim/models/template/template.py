@@ -21,13 +21,15 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits, UnitMotion
 from gausim.models.template.modal import ModalScene
-from gausim.models.template.solid import SolidSettings
+from gausim.models.template.solid import SolidSettings, solid_body
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
 ROWS = 1024  # of a matrix of distances that are in memory at once
 DENSITY = "density over that at the beginning of training"
+# The modes of an even solid: their number, the spacing of its grid and the typical displacement [diagonals].
+EVEN_MODES, EVEN_SPACING, TYPICAL = 48, 0.12, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +141,12 @@ class Template(nn.Module, ABC):
         """Prefixes of the names of a scene's parameters and buffers in the state dict, each after ``prefix``."""
         return ()
 
-    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Modes (N, 3, M) of one scene, displacement gradients (N, 3, 3, M), sizes (M,); None without modes.
+    @abstractmethod
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Modes (N, 3, M) of one scene, displacement gradients (N, 3, 3, M), sizes (M,).
 
-        See :class:`gausim.core.SmoothMotions`.
+        See :class:`gausim.core.SmoothMotions`. Motion is tracked in them.
         """
-        return None
 
     def vibrations(self, scene_id: int) -> int | None:
         """The number of the first modes of :meth:`basis` that vibrate by themselves; None for all."""
@@ -250,7 +252,7 @@ class PreparedScenes(PreparedTemplate):
 
 
 class RestTemplate(Template):
-    """The paper's template: the rest state."""
+    """The paper's template: the rest state. Its modes are those of an even solid, for tracking alone."""
 
     def __init__(
         self,
@@ -261,9 +263,41 @@ class RestTemplate(Template):
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
     ) -> None:
-        """Takes the arguments of every template; all are unused."""
+        """Takes the arguments of every template; ``frames`` are scene axes when empty."""
         super().__init__()
+        self._hierarchies, self._finest = hierarchies, finest
+        self._frames = frames or [np.eye(3)] * len(hierarchies)
+        self._bases: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
         return PreparedTemplate(batch)
+
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The lowest modes of an even solid of the body's shape, of equal energy; computed when first asked for."""
+        if scene_id not in self._bases:
+            self._bases[scene_id] = even_modes(self._hierarchies[scene_id], self._finest, self._frames[scene_id])
+        return self._bases[scene_id]
+
+
+def even_modes(hierarchy: Hierarchy, finest: int, frame: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+    """Modes (N, 3, M), displacement gradients and sizes of an even solid, of equal energy (see :meth:`Template.basis`).
+
+    Coordinate 1 of the first mode is a typical displacement, a twentieth of the diagonal. ``frame`` are the axes, as
+    rows.
+    """
+    level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
+    rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
+    own, solid = kernels.rest.double().numpy() @ frame.T, SolidSettings(spacing=EVEN_SPACING)
+    mass = level.volume.double().numpy()
+    body = solid_body(
+        own, kernels.pinned.numpy(), rest, mass / mass[~pinned].mean(), pinned,
+        modes=EVEN_MODES, spacing=solid.size(own, hierarchy.diagonal), inside=solid.held_inside,
+    )  # fmt: skip
+    modes, gradients = body.at(rest)
+    modes[pinned], gradients[pinned] = 0, 0
+    values = np.maximum(body.values, 1e-6 * body.values[-1]) / body.values[0]
+    sizes = values**-0.5
+    scale = TYPICAL * hierarchy.diagonal * np.sqrt((~pinned).sum()) * sizes
+    made = (torch.from_numpy(np.ascontiguousarray(x)).float() for x in (modes * scale, gradients * scale, sizes))
+    return next(made), next(made), next(made)

@@ -40,8 +40,7 @@ class Sources:
 
     scenes: Sequence[GaussianScene]
     truth: Callable[[int], GroundTruth | None]  # true motion of a sequence by its number, None where it is unknown
-    # smooth motions of the model's template, of a scene by its number; None where it has no such basis
-    motions: Callable[[int], SmoothMotions | None]
+    motions: Callable[[int], SmoothMotions]  # smooth motions of the model's template, of a scene by its number
     renderer: Renderer
     loss: ImageLoss  # image loss
     # references of a sequence, by its number, in the steps to frames 1..T; None where they are the rest state

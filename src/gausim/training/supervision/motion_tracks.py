@@ -84,15 +84,9 @@ class MotionTracker:
         self._keys, self._curvatures = ViewKeys(), dict[Hashable, Curvature]()
 
     def motions(self, scene_id: int) -> SmoothMotions:
-        """The smooth motions of a scene; raises ConfigError where the model has none."""
+        """The smooth motions of a scene."""
         if scene_id not in self._motions:
-            found = self._sources.motions(scene_id)
-            if found is None:
-                raise ConfigError(
-                    "supervision: motion is tracked in the smooth motions that a model's template carries, and this "
-                    "model has none. Use supervision=images with it."
-                )
-            self._motions[scene_id] = found
+            self._motions[scene_id] = self._sources.motions(scene_id)
         return self._motions[scene_id]
 
     def extend(self, known: Float[Tensor, "F M"] | None, sample: SequenceSample) -> Float[Tensor, "T M"]:
@@ -199,8 +193,6 @@ class TrackSupervision(PointSupervision):
         """``energy_weight`` is that of :class:`PointSupervision`, ``tracking`` are arguments of the tracker."""
         super().__init__(sources, energy_weight=energy_weight)
         self.tracker = MotionTracker(sources, **tracking)
-        for scene_id in range(len(sources.scenes)):
-            self.tracker.motions(scene_id)
         self._sources = sources
         self._coordinates: dict[int, Tensor] = {}
 
