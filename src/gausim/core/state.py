@@ -13,14 +13,25 @@ from gausim.core.scene import GaussianScene
 
 @dataclass(frozen=True, eq=False)
 class SimState:
-    """The state of the dynamics is exactly the kernels' two latest positions."""
+    """The state of the dynamics is the kernels' two latest positions, and for models with memory those before."""
 
     positions: Float[Tensor, "K 3"]  # x_t of all K kernels of the scene [scene units]
     previous: Float[Tensor, "K 3"]  # x_{t-1}, one frame earlier
+    older: tuple[Float[Tensor, "K 3"], ...] = ()  # x_{t-2}, x_{t-3}, ..., where they are known
 
     def detach(self) -> SimState:
         """The same values, detached from the graph of loss gradients."""
-        return SimState(self.positions.detach(), self.previous.detach())
+        return SimState(self.positions.detach(), self.previous.detach(), tuple(x.detach() for x in self.older))
+
+    def remembering(self, count: int) -> SimState:
+        """The state with ``count`` older frames; those that are not known continue the motion backwards evenly."""
+        older, last, step = list(self.older[:count]), self.previous, self.positions - self.previous
+        if older:
+            last, step = older[-1], (older[-2] if len(older) > 1 else self.previous) - older[-1]
+        while len(older) < count:
+            last = last - step
+            older.append(last)
+        return SimState(self.positions, self.previous, tuple(older))
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,7 @@ class GraphedRollouts:
         model = self._model
         return (
             isinstance(model, GausSim) and model.rollout.cuda_graph and model.log_density[0].device.type == "cuda"
+            and not model.history
             and len(model.scenes) == 1 and model.scenes[0].surroundings.still and model.predictor.edges == "rest"
         )  # fmt: skip
 

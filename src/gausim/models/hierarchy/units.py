@@ -24,6 +24,7 @@ class UnitMotion:
     load: Float[Tensor, "N 12"] | None = None
     # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
     floor: Float[Tensor, "N 4"] | None = None
+    older: tuple[Float[Tensor, "N 3"], ...] = ()  # at t - 2, t - 3, ..., in models with memory
 
 
 @dataclass(frozen=True, eq=False)

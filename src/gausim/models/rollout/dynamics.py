@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -125,7 +126,7 @@ class SceneStepper:
         def step(state: SimState, force: Tensor | None) -> Frame:
             return model.step(batch, state, force, prepared, hands=[hand_motion(self._hands, self._number)])
 
-        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves
+        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves and not model.history
         self._step = GraphedStep(step, batch.rest) if graphed else step
         self._guard: EnergyGuard | None = None
         # Gravity, impacts and hands change the energy of a body that is not in fixed pins.
@@ -160,7 +161,7 @@ class SceneStepper:
             positions = torch.where(held[:, None], self.state.positions, positions)
         self._number += 1
         self._note(0, positions)
-        self.state = SimState(positions, frame.following(self.state).previous)
+        self.state = replace(frame.following(self.state), positions=positions)
         self.frame = Frame(positions, frame.deformation_gradients, frame.rotations)
         return self.frame
 

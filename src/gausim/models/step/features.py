@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,24 +30,28 @@ class FeatureOptions:
             displacement of the template position.
         centred: positions in the middle of the step, where the template takes its forces: with its prediction they are
             (x_{t+1} + 2 x_t + x_{t-1}) / 4. What turns round in every frame is not seen there, and not driven on.
+        history: frames before the last two of which the velocities are inputs, too; for bodies in fixed pins.
         attributes: material attributes per unit.
         normaliser_floor: smallest standard deviation of a normalised input.
         floor: nearness of the units to the floor, in models of which a scene has one.
 
     Raises:
-        ConfigError: neither velocities nor rest_inputs.
+        ConfigError: neither velocities nor rest_inputs, or a negative history.
     """
 
     rest_inputs: bool = True
     coarse_inputs: bool = False
     velocities: bool = False
     centred: bool = True
+    history: int = 0
     attributes: int = 8
     normaliser_floor: float = 1e-2
     floor: bool = True
 
     def __post_init__(self) -> None:
         """Checks the choices."""
+        if self.history < 0:
+            raise ConfigError(f"model.simulator.features.history: expected at least 0, got {self.history}.")
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
                 "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
@@ -65,9 +70,8 @@ class FeatureOptions:
     @property
     def node_normalised(self) -> int:
         """Number of leading node features that are normalised."""
-        if not self.velocities:
-            return 9
-        return 12 if self.rest_inputs else 6
+        own = (12 if self.rest_inputs else 6) if self.velocities else 9
+        return own + 3 * self.history
 
     @property
     def node_size(self) -> int:
@@ -106,7 +110,7 @@ def network_inputs(
     Nodes have the inertial acceleration of the parent's frame and the local velocity, and with
     ``rest_inputs`` the displacement and the velocity to the coarse prediction; or what ``velocities=False`` stands for.
     ``target`` are the units' template positions, ``size`` the diagonals of their scenes [scene units]; ``coarse``
-    selects positions of the coarse prediction instead of the current ones.
+    selects positions of the coarse prediction instead of the current ones. Velocities of earlier frames follow.
     """
     coarsely = above.carry(target)
     # Positions at rest, at t, t - 1 and t + 1 of units and parents in diagonals, stacked and gathered together: on a
@@ -125,6 +129,8 @@ def network_inputs(
     else:
         lever = (unit.rest - above.rest.index_select(0, above.index)) / size
         columns = [lever, now - rest, (coarsely - target) / size]
+    past = (unit.before, *unit.older)
+    columns += [(late - early) / (size * dt) for late, early in itertools.pairwise(past)]
     columns += [unit.log_density[:, None], unit.attributes]
     if options.floor:
         near = unit.floor

@@ -57,7 +57,8 @@ class Prepared:
         if floor is not None:
             floor = torch.cat((floor[:, :1], apply(axes, floor[:, 1:])), 1)
         now, before = self._in_own_axes(seen.now), self._in_own_axes(seen.before)
-        return carried, UnitMotion(self.levels[-1].rest, now, before, load, floor)
+        older = tuple(self.finest(positions) for positions in state.older)
+        return carried, UnitMotion(self.levels[-1].rest, now, before, load, floor, older)
 
     def _in_own_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return self.frames.into(len(self.levels) - 1, positions)

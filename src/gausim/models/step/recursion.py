@@ -24,6 +24,7 @@ class Units:
     log_density: Float[Tensor, " N"]  # log of m_c / V_c
     attributes: Float[Tensor, "N A"]  # unweighted mean over the kernels
     floor: Float[Tensor, "N 4"] | None = None  # nearness to the floor, and its normal times the nearness
+    older: tuple[Float[Tensor, "N 3"], ...] = ()  # x_{t-2}, x_{t-3}, ..., in models with memory
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import Frame, GaussianScene, SimState
+from gausim.core import ConfigError, Frame, GaussianScene, SimState
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, UnitMotion, weighted_sum
 from gausim.models.reference.reference import HandMotion, Reference
@@ -72,6 +72,9 @@ class GausSim(SceneModel):
             conserve_volume=conserve_mass,
         )  # fmt: skip
         self.shape_bodies(self.template.solid)
+        self.history = features.history
+        if self.history and not all(scene.surroundings.still for scene in scenes):
+            raise ConfigError("model.simulator.features.history: expected 0 where bodies are free or in hands.")
         self.predictor = DeformationPredictor(
             features=features.of(scenes), network=network, head=head, edges=hierarchy.edges,
             conserve_mass=conserve_mass,
@@ -123,13 +126,18 @@ class GausSim(SceneModel):
         prepared = self.prepare(batch) if prepared is None else prepared
         state = state if force is None else self.pushed(prepared, state, force)
         # Kernels are aggregated to centres of mass of the finest units, relative to the reference that carries them.
+        state = state.remembering(self.history)
         carried, motion = prepared.aggregate(state, hands)
         # The levels are solved coarse to fine. Zero output of the network leaves the template as it is.
         finest, template, momentum, predicted = self._solve(prepared, motion, correction_scale, [])
         finest, template, gradients = prepared.in_scene_axes(finest, template, predicted)
         # Kernels inherit the motion and the deformation of their finest unit, and go back to the scene.
         frame = replace(inherit(finest, template, batch), momentum=momentum, predicted=gradients)
-        return carried.place(frame)
+        frame = carried.place(frame)
+        if not self.history:
+            return frame
+        older = (state.previous, *state.older)[: self.history]
+        return replace(frame, state=SimState(frame.positions, state.positions, older))
 
     def _solve(
         self, prepared: Prepared, motion: UnitMotion, correction_scale: float, outputs: list[Tensor]
@@ -144,13 +152,15 @@ class GausSim(SceneModel):
         targets, gradients = prepared.template(motion)
         now = self.predictor.features.positions(motion.before, motion.now, targets)
         states = [prepared.per_level(x) for x in (now, motion.before, targets)]
+        older = [prepared.per_level(x) for x in motion.older]
         above, momentum, predicted = prepared.roots, targets.new_zeros(()), []
         unit_of_correction = prepared.template.correction_unit()
         for position, (level, fixed, x, before, target, floor) in enumerate(
             zip(prepared.batch.levels, prepared.levels, *states, prepared.floors(motion), strict=True)
         ):
             above = replace(above, index=level.parent) if position else above
-            unit = Units(fixed.rest, x, before, fixed.mass, fixed.log_density, fixed.attributes, floor)
+            past = tuple(x[position] for x in older)
+            unit = Units(fixed.rest, x, before, fixed.mass, fixed.log_density, fixed.attributes, floor, past)
             # Inputs from the unit, its parent and its neighbours. The output at rest is subtracted.
             output = self.predictor(level, unit, above, target, position)
             outputs.append(output)
@@ -172,7 +182,8 @@ class GausSim(SceneModel):
         rest = prepared.levels[-1].rest
         outputs: list[Tensor] = []
         with gathering_nothing(normalisers_of(self.predictor)):
-            self._solve(prepared, UnitMotion(rest, rest, rest), 0.0, outputs)
+            still = UnitMotion(rest, rest, rest, older=(rest,) * self.history)
+            self._solve(prepared, still, 0.0, outputs)
         return replace(prepared, rest_outputs=tuple(outputs))
 
 
