@@ -104,7 +104,7 @@ OTHER: dict[str, Any] = {
     "model.simulator.hierarchy.edges": "union", "model.simulator.network.norm": "joint",
     "data.law": "springs",
     "model.simulator.hierarchy.levels": [{"diameter": 0.3, "edge_length": 1.0}],
-    "plan.schedule": "halving", "plan.clock": "cpu", "trainer.accelerator": "cpu", "plan.shared_from": 0.5,
+    "plan.schedule": "halving", "plan.clock": "cpu", "trainer.accelerator": "cpu",
     "name": "other", "output_root": "elsewhere", "init_from": "run", "freeze": "network",
     "ablation.name": "no_mass", "plan.t_start": 2,
 }  # fmt: skip

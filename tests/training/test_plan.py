@@ -6,18 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 import yaml
 from helpers.simulators import SMALLEST
 from omegaconf import OmegaConf
-from torch import nn
 
 from gausim.cli import train
 from gausim.compose.config import compose, instantiate
 from gausim.core import ConfigError
 from gausim.nn.schedules import CosineSchedule, HalvingSchedule
 from gausim.training.module import GausSimModule
-from gausim.training.optimizers import OptimizerSettings, set_rates
 from gausim.training.plan import DataFacts, TrainingPlan, WarmStart
 
 HELD, FREE = DataFacts(12, 16, can_warm_start=True), DataFacts(12, 16, can_warm_start=False)
@@ -90,7 +87,6 @@ def test_batches_and_limits_follow_the_data() -> None:
         ({"epochs": 0}, r"plan\.epochs: expected at least 1"),
         ({"t_start": 5, "t_max": 4}, r"t_start <= t_max"),
         ({"schedule": "moon"}, r"plan\.schedule: expected cosine, halving or null"),
-        ({"shared_from": 1.0}, r"plan\.shared_from: expected a fraction"),
         ({"clock": "moon"}, r"clock wall or cpu"),
         ({"max_minutes": 0.0}, r"max_minutes > 0"),
     ],
@@ -107,19 +103,6 @@ def test_schedules() -> None:
     assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]
     stable = CosineSchedule(warmup=2.0, decay=0.25, final=0.1)
     assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
-
-
-def test_shared_weights_wait_for_their_part_of_the_run() -> None:
-    settings, plan = (
-        OptimizerSettings(network_lr=0.1, scene_lr=0.2, template_lr=0.3),
-        TrainingPlan(shared_from=0.5, schedule=None, warm_start=None),
-    )
-    optimizer = settings.build({name: [nn.Parameter(torch.zeros(1))] for name in ("network", "scene", "template")})
-    found = []
-    for done, shared in ((0.49, ("network", "template")), (0.49, ("network",)), (0.5, ("network", "template"))):
-        set_rates(optimizer, lambda n, done=done, shared=shared: plan.rate_factor(n, done, shared=n in shared))
-        found.append([group["lr"] for group in optimizer.param_groups])
-    assert found == [[0.0, 0.2, 0.0], [0.0, 0.2, 0.3], [0.1, 0.2, 0.3]]
 
 
 @pytest.mark.parametrize("start", [["plan.warm_start.updates=5"], ["plan.warm_start=null"]])

@@ -43,7 +43,7 @@ def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_check
     common = [f"data.root={toy}", *choice, *QUICK, "plan.warm_start.updates=60"]
     assert train.main([*common, "plan.epochs=2", f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
     printed = capsys.readouterr().out
-    assert "warm start: 2 sequences tracked" in printed
+    assert "track: 2 sequences; of the 2 whose true motion is known" in printed and "warm start: " in printed
     first = float(rows(tmp_path / "whole/epochs.csv")[0]["excess_static"])
     bare = [*common[:-1], "plan.warm_start=null", "plan.epochs=1"]
     assert train.main([*bare, f"hydra.run.dir={tmp_path / 'bare'}"]) == 0

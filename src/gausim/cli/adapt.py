@@ -91,6 +91,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "epochs": arguments.epochs,
         "max_minutes": None,
         "warm_start": None,
+        "teach": None,
     }
     adapted = config | {
         "data": data,

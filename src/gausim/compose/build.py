@@ -117,7 +117,9 @@ def resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingPl
     ranks = int(trainer.get("devices", 1)) * int(trainer.get("num_nodes", 1))
     frames = min(len(item.train_frames) for item in datamodule.objects)
     if "method" not in config.model:
-        return plan.resolved(DataFacts(count, frames, _can_warm_start(config, datamodule)), ranks=ranks)
+        can = _can_warm_start(config, datamodule)
+        held = can and any(record.hands is not None for _, record in datamodule.index.entries)
+        return plan.resolved(DataFacts(count, frames, can, can and not held), ranks=ranks)
     # The sequences are fitted independently, in stages of their own.
     own = instantiate(config.model.plan)
     plan = replace(plan, epochs=max(1, own.epochs), repeats=own.shows, batch_size=plan.batch_size or 1)

@@ -259,7 +259,7 @@ def _course(module: GausSimModule, datamodule: ReadyDataModule, config: dict[str
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
     """A warning if initial states cannot reach the first step of a typical motion within ``shows``."""
     states, rate = cast(Any, module.initial_states), module.settings.initial_lr
-    if states is None or module.plan.warm_start is not None:
+    if states is None or module.plan.warm_start or module.plan.teach:  # which find them in the tracks
         return []
     reach = states.reach(rate * shows)
     if reach >= FIRST_STEP:

@@ -40,11 +40,11 @@ class SharedSimulator:
         count = len(self.scene_of_sequence)
         if (own := len(list(initial_states.parameters()))) != count:
             raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
-        self._simulator, self._states = cast(Simulator, model), cast(Any, initial_states)
+        self._simulator, self.states = cast(Simulator, model), cast(Any, initial_states)
         self._hands = dict(enumerate(hands))
         for sequence_id, path in self._hands.items():
             if path is not None:
-                self._states.hold(sequence_id, path)
+                self.states.hold(sequence_id, path)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
         """The model's parameter groups, and the initial states."""
@@ -63,7 +63,7 @@ class SharedSimulator:
 
     def state(self, sequence_id: int, start: int = 0) -> SimState:
         """The state at which rollouts of a sequence begin; ``start`` is 0 where states of later frames are unknown."""
-        state: SimState = self._states.state(sequence_id)
+        state: SimState = self.states.state(sequence_id)
         return state
 
     def hands(self, sequence_id: int) -> Hands | None:

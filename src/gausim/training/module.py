@@ -17,9 +17,9 @@ from gausim.runs.checkpoint import check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
 from gausim.training.optimizers import set_rates
 from gausim.training.plan import TrainingPlan
+from gausim.training.stages import begin
 from gausim.training.step import OptimiserStep
 from gausim.training.supervision.motion_tracks import TrackSupervision
-from gausim.training.warm_start import warm_start
 
 # Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
@@ -79,8 +79,7 @@ class GausSimModule(OptimiserStep, LightningModule):
         optimizer, trainer = cast(Any, self.optimizers()), self.trainer
         batches = float(trainer.num_training_batches)
         done = self.plan.progress(self.current_epoch + batch_idx / max(1.0, batches), self.minutes)
-        shared = getattr(self.model, "shared_groups", ("network",))
-        set_rates(optimizer.optimizer, lambda name: self.plan.rate_factor(name, done, shared=name in shared))
+        set_rates(optimizer.optimizer, lambda name: self.plan.rate_factor(name, done))
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
         rate = self.settings.network_lr * self.plan.rate_factor("network", done)
@@ -119,12 +118,12 @@ class GausSimModule(OptimiserStep, LightningModule):
         return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
 
     def on_train_start(self) -> None:
-        """Starts to measure the cost of training, and makes the warm start of a run that is not resumed."""
+        """Starts to measure the cost of training, and makes the first stages of a run that is not resumed."""
         self.cost.begin()
         self._look_at_the_clock()
-        if self.plan.warm_start is not None and not self.global_step:
-            quiet = not self.trainer.progress_bar_callback
-            warm_start(self, cast(Any, self.trainer).datamodule, self.plan.warm_start, quiet=quiet)
+        if not self.global_step:
+            trainer = cast(Any, self.trainer)
+            begin(self, trainer.datamodule, self.plan, seed=self.seed, quiet=not trainer.progress_bar_callback)
 
     def on_train_epoch_start(self) -> None:
         """Resets the epoch's sums."""

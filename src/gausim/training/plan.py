@@ -1,4 +1,4 @@
-"""The training plan: the only place that decides epochs, T, learning-rate factors, the warm start and the end."""
+"""The training plan: the only place that decides epochs, T, learning-rate factors, the first stages and the end."""
 
 from __future__ import annotations
 
@@ -53,12 +53,41 @@ class WarmStart:
 
 
 @dataclass(frozen=True)
+class Teaching:
+    """Training on tracked motion before the first optimiser step: single steps, then rollouts on the tracks.
+
+    A show is all seen frames of a sequence. The rates are those of the optimiser, falling in each part.
+
+    Attributes:
+        shows: shows of each sequence in single steps.
+        rolls: shows of each sequence in rollouts, T growing from 2 to all seen frames.
+        noise: deviation of the noise of every unit in single steps, of its velocity half as much per frame [diagonals].
+        roll_factor: factor on the learning rates in the rollouts.
+        rate_factor: factor on all learning rates in the training that follows.
+    """
+
+    shows: int = 60
+    rolls: int = 60
+    noise: float = 1e-3
+    roll_factor: ClassVar[float] = 0.2
+    rate_factor: ClassVar[float] = 0.2
+
+    def __post_init__(self) -> None:
+        if min(self.shows, self.rolls) < 0 or self.shows + self.rolls < 1 or not self.noise >= 0:
+            raise ConfigError(
+                "plan.teach: expected shows and rolls of at least 0, one of them more, and noise >= 0, got "
+                f"{self.shows}, {self.rolls} and {self.noise}. Without teaching it is null."
+            )
+
+
+@dataclass(frozen=True)
 class DataFacts:
     """What a plan needs to know of the data."""
 
     sequences: int  # to train on
     frames: int  # seen frames, of the object that has fewest
     can_warm_start: bool  # whether the motion can be tracked: no body is free, none is above a floor
+    can_teach: bool | None = None  # and no body is in hands; None: as ``can_warm_start``
 
 
 @dataclass(frozen=True)
@@ -75,9 +104,10 @@ class TrainingPlan:
         t_max: most predicted frames; None: all seen frames, at most 60.
         schedule: factor on all learning rates by the part that is done: ``cosine``, ``halving`` (METHOD section 4) or
             another schedule; None: constant.
-        shared_from: fraction of the training from which weights common to all scenes are trained.
         warm_start: the fit before the first step; None: training starts from rest and a material at random. It is left
             out where bodies are free or above a floor, and where they are in hands and compared with true points.
+        teach: the network's training on tracked motion after it, left out likewise and for all bodies in hands; None:
+            the network starts at random.
         max_minutes: limit of the training time, resumed runs included; the rates then follow the time, too.
         clock: ``wall``, or ``cpu`` for the processor time of this process.
     """
@@ -88,8 +118,8 @@ class TrainingPlan:
     t_start: int | None = None
     t_max: int | None = None
     schedule: Schedule | str | None = "cosine"
-    shared_from: float = 0.0
     warm_start: WarmStart | None = WarmStart()
+    teach: Teaching | None = None
     max_minutes: float | None = None
     clock: str = "wall"
 
@@ -101,8 +131,6 @@ class TrainingPlan:
                 raise ConfigError(f"plan.{name}: expected at least 1, got {value}.")
         if self.t_start is not None and self.t_max is not None and self.t_start > self.t_max:
             raise ConfigError(f"plan: expected t_start <= t_max, got {self.t_start} and {self.t_max}.")
-        if not 0 <= self.shared_from < 1:
-            raise ConfigError(f"plan.shared_from: expected a fraction in [0, 1), got {self.shared_from}.")
         if isinstance(self.schedule, str) and self.schedule not in SCHEDULES:
             raise ConfigError(f"plan.schedule: expected {', '.join(SCHEDULES)} or null, got '{self.schedule}'.")
         if self.clock not in ("wall", "cpu") or (self.max_minutes is not None and not self.max_minutes > 0):
@@ -119,26 +147,28 @@ class TrainingPlan:
             ConfigError: ``t_max`` is beyond the seen frames.
         """
         warm = self.warm_start if data.can_warm_start else None
+        teach = self.teach if (data.can_warm_start if data.can_teach is None else data.can_teach) else None
         t_max = max(1, min(data.frames - 1, LONGEST)) if self.t_max is None else self.t_max
         if t_max >= data.frames:
             raise ConfigError(
                 f"plan.t_max: {t_max} predicted frames would see frame {t_max}, but training sees frames "
                 f"0..{data.frames - 1}; expected at most {data.frames - 1}."
             )
-        first = t_max if warm else min(FIRST, t_max)
+        first = t_max if warm or teach else min(FIRST, t_max)
         return replace(
             self,
             warm_start=warm,
+            teach=teach,
             t_max=t_max,
             t_start=first if self.t_start is None else self.t_start,
-            epochs=self.epochs or (WARM_EPOCHS if warm else COLD_EPOCHS),
+            epochs=self.epochs or (WARM_EPOCHS if warm or teach else COLD_EPOCHS),
             batch_size=self.batch_size or max(ranks, min(4, data.sequences // 3)),
         )
 
     def settings(self) -> dict[str, Any]:
         """The keys of the node ``plan`` that :meth:`resolved` decides."""
         found = {name: getattr(self, name) for name in ("epochs", "batch_size", "t_start", "t_max")}
-        return found if self.warm_start else {**found, "warm_start": None}
+        return {**found, **{name: None for name in ("warm_start", "teach") if getattr(self, name) is None}}
 
     # ------------------------------------------------------------------------------------------------ course
 
@@ -156,14 +186,14 @@ class TrainingPlan:
         """The part of the training that is done after some epochs and minutes, at most 1."""
         return min(1.0, max(epochs / (self.epochs or 1), self.time_fraction(minutes)))
 
-    def rate_factor(self, group: str, progress: float, *, shared: bool = False) -> float:
+    def rate_factor(self, group: str, progress: float) -> float:
         """The factor on the learning rate of a parameter group at a part of the training.
 
-        ``shared`` groups are those common to all scenes. After a warm start all but the network have lower rates.
+        After a warm start all but the network have lower rates, after teaching all have.
         """
-        if shared and progress < self.shared_from:
-            return 0.0
         epochs = self.epochs or 1
         schedule = SCHEDULES[self.schedule] if isinstance(self.schedule, str) else self.schedule
         factor = 1.0 if schedule is None else schedule.factor(round(progress * epochs, 9), epochs)
+        if self.teach is not None:
+            return factor * self.teach.rate_factor
         return factor if self.warm_start is None or group == "network" else factor * self.warm_start.rate_factor

@@ -10,15 +10,13 @@ starts from there, with the network.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from gausim.core import ConfigError
-from gausim.data.datamodule import ReadyDataModule
-from gausim.data.dataset import SequenceSample
 from gausim.models.initial_state import InitialStates
 from gausim.models.step.simulator import GausSim
 from gausim.runs.bar import with_bar
@@ -26,52 +24,25 @@ from gausim.training import modal_fit
 from gausim.training.learner import Learner
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.plan import USUAL, TrainingPlan, WarmStart
-from gausim.training.supervision.images import Sources
-from gausim.training.supervision.motion_tracks import TrackSupervision
-from gausim.training.supervision.points import PointSupervision
-
-# Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
-Tracked = list[tuple[SequenceSample, Tensor]]
+from gausim.training.plan import USUAL, WarmStart
+from gausim.training.tracking import Track
 
 
-def warm_start(learner: Learner, data: ReadyDataModule, settings: WarmStart, *, quiet: bool = False) -> None:
-    """Tracks all training sequences and fits initial states and material to them, on the first rank for all.
+def warm_start(learner: Learner, tracks: Sequence[Track], settings: WarmStart, *, quiet: bool = False) -> None:
+    """Fits initial states and material to tracked motion (:func:`gausim.training.tracking.track`).
 
     Raises:
-        ConfigError: the model has no modes in which motion is tracked.
+        ConfigError: the template has no material to fit.
     """
-    model = learner.model
-    if not isinstance(model, GausSim) or any(model.template.basis(i) is None for i in range(len(model.scenes))):
-        raise ConfigError("plan.warm_start: expected a model whose template has modes. Set plan.warm_start=null.")
+    model, states = learner.model, cast(InitialStates, learner.initial_states)
+    if not isinstance(model, GausSim) or not model.template.has_energy:
+        raise ConfigError("plan.warm_start: expected a template with a material. Set plan.warm_start=null.")
     groups = {name: own for name, own in learner.groups().items() if name != "network"}
-    weights = [p for own in groups.values() for p in own]
-
-    def fitted() -> list[Tensor]:
-        _fit(learner, data, settings, groups, quiet=quiet)
-        return [p.detach().cpu() for p in weights]
-
-    with torch.no_grad():
-        for weight, value in zip(weights, learner.ranks.first(fitted), strict=True):
-            weight.copy_(value.to(weight))
-
-
-def _fit(learner: Learner, data: ReadyDataModule, settings: WarmStart, groups: Any, *, quiet: bool) -> None:
-    model, last = cast(GausSim, learner.model), cast(TrainingPlan, data.plan).t_max or 1
-    tracks, states = learner.supervision, cast(InitialStates, learner.initial_states)
-    device = next(model.parameters()).device
-    if not isinstance(tracks, PointSupervision):
-        motions_of, image, references = model.smooth_motions, learner.objective.image, learner.method.references
-        sources = Sources(model.scenes, lambda number: None, motions_of, learner.renderer, image, references)
-        tracks = TrackSupervision(sources)
-    tracked: dict[int, Tracked] = {}
-    count = len(data.index.entries)
-    for number in with_bar(range(count), "Tracking the motion", quiet=quiet):
-        sample = data.training_sample(number, last).to(device)
-        moved = tracks.displacements(sample).to(device)
-        states.set_motion(number, moved[1])
-        tracked.setdefault(sample.scene_id, []).append((sample, moved))
-    motions = [(i, _known(learner, states, i, own, settings.sequences)) for i, own in tracked.items()]
+    scenes: dict[int, list[Track]] = {}
+    for known in tracks:
+        scenes.setdefault(known.sample.scene_id, []).append(known)
+    motions = [(i, _known(learner, states, i, own, settings.sequences)) for i, own in scenes.items()]
+    last = len(tracks[0].moved) - 1
     updates = math.ceil(settings.updates * min(1.0, USUAL / last))
     rates = OptimizerSettings(
         optimizer=torch.optim.AdamW,
@@ -85,17 +56,16 @@ def _fit(learner: Learner, data: ReadyDataModule, settings: WarmStart, groups: A
         losses = modal_fit.fit(model, motions, rates, groups, longest=last, updates=updates, growing=settings.growing)
         for loss in with_bar(losses, "Fitting the material", total=updates, quiet=quiet):
             final = loss
-    sequences = f"{count} sequence{'s' if count != 1 else ''}"
-    print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
+    print(f"  warm start: without a network {final:.3f} of the motion is left", flush=True)
 
 
 def _known(
-    learner: Learner, states: InitialStates, scene_id: int, tracked: Tracked, most: int
+    learner: Learner, states: InitialStates, scene_id: int, tracked: Sequence[Track], most: int
 ) -> Callable[[int], KnownMotion]:
     """T frames of some of the sequences of a scene as they were tracked, from their trained initial states."""
-    draws, numbers = torch.Generator().manual_seed(0), [sample.sequence_id for sample, _ in tracked]
+    draws, numbers = torch.Generator().manual_seed(0), [known.sample.sequence_id for known in tracked]
     projection = cast(GausSim, learner.model).modal_projection(scene_id).flatten(0, 1)
-    z = torch.stack([moved.flatten(1) @ projection for _, moved in tracked])
+    z = torch.stack([known.moved.flatten(1) @ projection for known in tracked])
     size = modal_fit.size_of(z[:, 1:])
     found = [learner.method.references(number, z.shape[1] - 1) for number in numbers]
     loads = [torch.stack([cast(Tensor, units.load) for _, units in own]) for own in found if own is not None]
