@@ -46,7 +46,7 @@ def test_whole_evaluation(run, capsys):
     folder = run.run_dir / "evaluation"
     assert "`gausim prepare lpips` gets them" in (folder / "table.md").read_text()
     lines = captured.out.splitlines()
-    assert lines[0].startswith("toy: On frames never seen") and "it foresees the motion closely." in lines[0]
+    assert lines[0].startswith("toy: On frames never seen") and "it predicts the motion closely." in lines[0]
     assert lines[1] == f"tables: {(folder / 'table.md').as_uri()}" and lines[2] == f"next: gausim report {run.run_dir}"
     assert len(lines) == 4 and "not finished" not in captured.err
     names = {p.name for p in folder.iterdir()}

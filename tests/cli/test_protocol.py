@@ -161,7 +161,7 @@ def test_looks_are_declared_counted_and_said(
     for name in ("page/report.html", "page/results.md", "page/tables.tex", "results/results.md", "results/tables.tex"):
         text = (run / name).read_text().replace("\\", "")
         tables = text.count("<table") or text.count("| ---") or text.count("begin{tabular}")
-        assert tables and "Figures of the test part" in text and "6 trials, 2 looks" in text, name
+        assert tables and "Figures of the test part" in text and "6 trials, 2 test evaluations" in text, name
 
 
 def test_a_damaged_record_of_looks_is_refused(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_a_damaged_record_of_looks_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"test\.json: expected .* as many entries of 'history'"):
         read_looks(path)
     path.write_text("{}")
-    with pytest.raises(RunError, match=r"test\.json: expected the looks"):
+    with pytest.raises(RunError, match=r"test\.json: expected the record"):
         read_looks(path)
 
 

@@ -60,7 +60,7 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     assert [(r["epoch"], float(r["steps"])) for r in rows(RUN / "epochs.csv")] == [("1", 1.0), ("2", 2.0)]
     assert [p.name for p in sorted((RUN / "panels").iterdir())] == ["step_000001", "step_000002"]
     told = capsys.readouterr().out
-    assert "36 kernels" in told and "warning: in 2 shows at optimizer.initial_lr=" in told
+    assert "36 kernels" in told and "warning: in 2 uses of a sequence at optimizer.initial_lr=" in told
     assert "WARNING  extent" in told and "frames of each sequence only" in told and "NOTE" not in told
     result, address, *following = told.splitlines()[-4:]
     assert result.startswith("Trained for 2 epochs (") and "% of the static prediction's" in result

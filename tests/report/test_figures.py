@@ -33,15 +33,15 @@ def test_the_moving_line_is_found_and_cut():
     assert np.array_equal(space_time_slice(images.swapaxes(1, 2), ("row", 17)), cut)
 
 
-def test_video_frames_have_one_size_and_mark_what_is_foreseen():
+def test_video_frames_have_one_size_and_mark_what_is_unseen():
     images, timeline = swinging(), Timeline(12, 5)
     seen = video_frame(images[4], images[4], 4, timeline, "seq")
-    foreseen = video_frame(images[5], images[5], 5, timeline, "seq")
+    unseen = video_frame(images[5], images[5], 5, timeline, "seq")
     beyond = video_frame(None, images[5], 11, timeline, "seq")
-    assert seen.shape == foreseen.shape == beyond.shape and seen.dtype == np.uint8
+    assert seen.shape == unseen.shape == beyond.shape and seen.dtype == np.uint8
     orange = (240, 150, 40)
     assert not (seen == orange).all(-1).any()
-    assert (foreseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
+    assert (unseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
 
 
 def test_slices_and_sheets_show_truth_and_prediction(tmp_path):

@@ -48,7 +48,7 @@ def said(
 def test_a_good_run_is_called_good():
     assert said() == (
         "On frames never seen (16–49), its points are 0.30 times as far off as those of a model that predicts no "
-        "motion (0.20 on the frames it was trained on): it foresees most of the motion.",
+        "motion (0.20 on the frames it was trained on): it predicts most of the motion.",
         "Its motion there has 0.90 times the energy of the true motion: it is about as lively as the object.",
     )
 
@@ -56,7 +56,7 @@ def test_a_good_run_is_called_good():
 @pytest.mark.parametrize(
     ("sentence", "error", "seen", "energy", "words"),
     [
-        (0, 0.199, 0.1, 0.9, "it foresees most of the motion"),  # printed as 0.20
+        (0, 0.199, 0.1, 0.9, "it predicts most of the motion"),  # printed as 0.20
         (0, 0.97, 0.5, 0.9, "no better than predicting no motion, although it learned the frames it was trained on"),
         (0, 1.4, 0.95, 0.9, "worse than predicting no motion, and it learned no more of the frames it was trained on"),
         (1, 0.95, 0.2, 1.0, "it moves as much as the object, but not as the object does"),
@@ -79,7 +79,7 @@ def test_what_is_not_measured_is_not_made_up():
 def test_seeds_are_averaged_and_a_fit_that_repeats_is_no_foresight():
     assert "(16–49; mean of 2 seeds), its points are 0.40 times" in said(seeds=(0.3, 0.5))[0]
     assert said(repeats=True)[0].endswith(
-        "does not foresee, but repeats what was fitted to the frames it was trained on."
+        "does not extrapolate, but repeats what was fitted to the frames it was trained on."
     )
 
 

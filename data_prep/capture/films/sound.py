@@ -52,7 +52,7 @@ def sound_lag(first: np.ndarray, second: np.ndarray, rate: int) -> Lag:
     peaks, _ = find_peaks(np.pad(scores, 1, constant_values=-1), distance=int(APART * ENVELOPE_RATE))
     best = sorted(peaks - 1, key=lambda i: -scores[i])[:CANDIDATES]
     if not best:
-        raise DataError("its sound is as loud all the time; nothing tells where it belongs.")
+        raise DataError("its sound is as loud all the time; it cannot be aligned.")
     whitened = correlate(_white(a), _white(b))
     found = [_placed(whitened, len(b), lags[i] / ENVELOPE_RATE, float(scores[i]), rate) for i in best]
     for name, needed, clearer in (("sharpness", SHARP, CLEARER), ("likeness", LIKE, LOUDER)):

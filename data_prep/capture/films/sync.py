@@ -72,7 +72,7 @@ def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float
             return _by(name, films, given)
         except DataError as error:
             reasons.append(f"{name}: {error}")
-    raise DataError("nothing tells how these films belong together.\n  " + "\n  ".join(reasons))
+    raise DataError("these films cannot be synchronised.\n  " + "\n  ".join(reasons))
 
 
 def align(

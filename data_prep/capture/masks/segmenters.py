@@ -107,7 +107,7 @@ class ChromaSegmenter:
         key = np.median(border, axis=0) if self.key is None else lab(np.full((1, 1, 3), self.key, np.uint8))[0, 0]
         if np.hypot(key[1], key[2]) < 15:
             raise DataError(
-                f"{clip.file(0)}: the screen's colour is nearly grey, so hue tells nothing. State it with --key, or "
+                f"{clip.file(0)}: the screen's colour is nearly grey, so its hue is undefined. State it with --key, or "
                 "choose another --backend."
             )
 

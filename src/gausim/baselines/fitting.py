@@ -193,7 +193,7 @@ class Fit:
             seconds = time.monotonic() - began
             row = {"epoch": self.epoch, "step": self.step, "stage": self.stage, "seconds": seconds, **self.summary}
             table.append({name: short(value) for name, value in row.items()})
-            said = f"T {self.summary['steps']:.0f}  {self.summary.get('excess_static', float('nan')):.3f} of static"
+            said = f"T {self.summary['steps']:.0f}  loss/static {self.summary.get('excess_static', float('nan')):.3f}"
             print(f"epoch {self.epoch}  stage {self.stage}  {said}  {seconds:.1f} s", flush=True)
             self.save()
 

@@ -27,7 +27,11 @@ def _parser() -> argparse.ArgumentParser:
     add_names(parser, "objects", "measure these objects (default: all)")
     add_names(parser, "sequences", "measure these sequences of every object (default: all)")
     add("--cameras", default="all", choices=("all", "train", "heldout"), help="measure in these (default: all)")
-    add("--test", action="store_true", help="look at the test part of the data; counted in evaluation/test.json")
+    add(
+        "--test",
+        action="store_true",
+        help="evaluate the test part; evaluation/test.json counts it",
+    )
     add("--trials", type=positive, metavar="N", help="with --test: declare N trials of the method on the development "
         "part (default: trials of the run)")  # fmt: skip
     add("--flip", action="store_true", help="also measure FLIP (extra `flip`), in as much time as all other metrics")

@@ -150,7 +150,7 @@ def _choose(run: LoadedRun, arguments: argparse.Namespace) -> tuple[str | None, 
             "declare one (field 'test' of dataset.json, or data.test)."
         )
     if arguments.trials and not arguments.test:
-        raise ConfigError("--trials: declares the trials before a look at the test part; give --test with it.")
+        raise ConfigError("--trials: declares the trials before a test evaluation; give --test with it.")
     found = {}
     for item in items:
         names = arguments.sequences or [record.name for record in item.data.sequences]

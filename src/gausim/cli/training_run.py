@@ -92,7 +92,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None or excess < -1:  # the motion is smaller than the error of the reconstruction
         return [f"{begin}.", *more]
-    falls = {True: " and still falls", False: " and no longer falls", None: ""}[facts.get("still_falls")]
+    falls = {True: " and still falls", False: " and has stopped falling", None: ""}[facts.get("still_falls")]
     return [
         f"{begin}: on training frames, the loss beyond the reconstruction's is {100 * excess:.0f} % of the static "
         f"prediction's{falls}.",

@@ -97,7 +97,7 @@ def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
     reserved = [name in part_of for part_of, name in names]
     if part == TEST_PART and not trials:
         raise ConfigError(
-            f"trials: expected the number of trials made on the development part for a look at the test part "
+            f"trials: expected the number of trials made on the development part before a test evaluation "
             f"(data.part=test), got {trials}."
         )
     if part != TEST_PART and all(reserved):
@@ -246,7 +246,7 @@ def _course(module: GausSimModule, datamodule: ReadyDataModule, config: dict[str
     shows, frames = epochs * plan.repeats, sum(plan.steps(epoch) * batches for epoch in range(epochs))
     lines = [
         f"compared with {COMPARED.get(kind, kind)}",
-        f"{epochs} epochs of {batches} steps, {shows} shows of each sequence; "
+        f"{epochs} epochs of {batches} steps, {shows} uses of each sequence; "
         f"T {plan.steps(0)} to {plan.t_max}, {frames} predicted frames",
         *_slow_beginnings(module, shows),
     ]
@@ -265,7 +265,7 @@ def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
     if reach >= FIRST_STEP:
         return []
     return [
-        f"warning: in {shows} shows at optimizer.initial_lr={rate:g} an initial state moves by {reach:.2g} of the "
-        f"diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
+        f"warning: in {shows} uses of a sequence at optimizer.initial_lr={rate:g} an initial state moves by "
+        f"{reach:.2g} of the diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
         f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or plan.epochs."
     ]

@@ -343,7 +343,7 @@ class Interaction:
             kernel = int(carried.nonzero()[0])
             unit = int(self.unit_of_kernel[kernel])
             raise self._diverged(
-                f"the covariance of kernel {kernel} is no longer positive definite (its unit {unit} is flattened)"
+                f"the covariance of kernel {kernel} is not positive definite (its unit {unit} is flattened)"
             )
 
     def _diverged(self, what: str) -> DivergenceError:

@@ -115,7 +115,7 @@ def slices_plot(
             if column == 0:
                 axes.set_ylabel(label, fontsize=8)
         panels[0].set_title(f"{title}: {line[0]} {line[1]} over time", fontsize=9)
-        panels[-1].set_xlabel("frame (foreseen right of the line)", fontsize=8)
+        panels[-1].set_xlabel("frame (unseen right of the line)", fontsize=8)
     return figure, lines
 
 
@@ -146,8 +146,8 @@ def panels_plot(
             if image is not None:
                 axes.imshow(image)
         panels[0].set_ylabel(label, fontsize=8)
-    for axes, (head, foreseen) in zip(grid[0], heads, strict=True):
-        axes.set_title(head, fontsize=7, color="#c2410c" if foreseen else "black")
+    for axes, (head, unseen) in zip(grid[0], heads, strict=True):
+        axes.set_title(head, fontsize=7, color="#c2410c" if unseen else "black")
     return figure
 
 

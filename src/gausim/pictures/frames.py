@@ -11,7 +11,7 @@ import numpy as np
 ERROR_RANGE = 0.5
 PANEL_HEIGHT = 320
 _BAR, _LINE = 24, 8
-SEEN, FORESEEN = (120, 160, 200), (240, 150, 40)
+SEEN, UNSEEN = (120, 160, 200), (240, 150, 40)
 _INK, _PAPER = (235, 235, 235), (24, 24, 24)
 # Brightness to which the brightest percentile of the true foreground is raised, and the largest gain.
 _LIGHT, _MOST_GAIN = 230.0, 2.5
@@ -66,11 +66,11 @@ def label_bar(text: str, width: int) -> np.ndarray:
 
 def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
     """Title, number of the frame and time line, which is orange from the first unseen frame on."""
-    foreseen = frame >= timeline.first_unseen
-    state = "FORESEEN" if foreseen else "seen in training"
+    unseen = frame >= timeline.first_unseen
+    state = "UNSEEN" if unseen else "seen in training"
     bar = label_bar(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
-    if foreseen:
-        bar[:, -_BAR:] = FORESEEN
+    if unseen:
+        bar[:, -_BAR:] = UNSEEN
     return np.concatenate((bar, time_line(frame, timeline, width)))
 
 
@@ -79,7 +79,7 @@ def time_line(frame: int, timeline: Timeline, width: int) -> np.ndarray:
     line = np.full((_LINE, width, 3), _PAPER, np.uint8)
     begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
     line[:, : min(begin, now)] = SEEN
-    line[:, begin:now] = FORESEEN
+    line[:, begin:now] = UNSEEN
     line[:, min(begin, width - 1) :][:, :2] = _INK
     return line
 

@@ -216,7 +216,7 @@ def _frames(shown: Shown) -> Exhibit:
     places = [(f, v) for f in chosen for v in _some_views(pictures)]
     rows = [(_short(label), [images[place] for place in places]) for label, images in shown.columns]
     heads = [(f"{_view_name(pictures, v)}, {f}", f >= border) for f, v in places]
-    caption = f"Camera and frame; orange: foreseen. {shown.note}"
+    caption = f"Camera and frame; orange: unseen frames. {shown.note}"
     return Exhibit(f"Frames: {pictures.object}", caption, "image", _drawn(panels_plot(rows, heads)))
 
 

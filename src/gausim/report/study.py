@@ -254,14 +254,14 @@ def _test_part(groups: Sequence[Group]) -> str:
         tested = [run.state for run in group.evaluated if run.state.get("part") == "test"]
         if tested:
             trials, looks = (_range([state.get(key) for state in tested]) for key in ("trials", "looks"))
-            told.append(f"{group.label}: {counted(trials, 'trial')}, {counted(looks, 'look')}")
+            told.append(f"{group.label}: {counted(trials, 'trial')}, {counted(looks, 'test evaluation')}")
         others += [group.label] if len(tested) < len(group.evaluated) else []
     if not told:
         return ""
     more = f" Not of a test part: {', '.join(others)}." if others else ""
     return (
-        "Figures of the test part, on which nothing was tuned; declared trials on the development part and looks at "
-        f"the test part: {'; '.join(told)}.{more}"
+        "Figures of the test part, on which nothing was tuned; declared trials on the development part and "
+        f"test evaluations: {'; '.join(told)}.{more}"
     )
 
 

@@ -17,9 +17,9 @@ NAMES = {STATIC: "no motion", BALLISTIC: "rigid flight", FOLLOW_HANDS: "the hand
 NO_BETTER = 0.9
 # Upper limits and words, for the error over the reference's and for predicted over true energy.
 _FORESIGHT = (
-    (0.2, "it foresees the motion closely"),
-    (0.5, "it foresees most of the motion"),
-    (NO_BETTER, "it foresees part of the motion"),
+    (0.2, "it predicts the motion closely"),
+    (0.5, "it predicts most of the motion"),
+    (NO_BETTER, "it predicts part of the motion"),
     (1.1, "that is no better than predicting {reference}"),
     (math.inf, "that is worse than predicting {reference}"),
 )
@@ -103,7 +103,7 @@ def _off(found: Outcome, error: float) -> str:
 def _foresight(found: Outcome) -> str:
     assert found.error is not None
     if found.repeats:
-        return "it does not foresee, but repeats what was fitted to the frames it was trained on"
+        return "it does not extrapolate, but repeats what was fitted to the frames it was trained on"
     words = _words(_FORESIGHT, found.error).format(reference=found.reference)
     if found.error < NO_BETTER or found.seen_error is None:
         return words

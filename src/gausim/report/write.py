@@ -16,7 +16,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from gausim.io.files import write_durably
-from gausim.pictures.frames import FORESEEN, SEEN
+from gausim.pictures.frames import SEEN, UNSEEN
 from gausim.report.layouts import SECTIONS, grids
 from gausim.report.media import object_figures
 from gausim.report.opening import Opening, make_openings, unanswered
@@ -113,7 +113,7 @@ def _page(study: Study, tables: Sequence[Grid], openings: Sequence[Opening], **c
     ``openings`` are first screens, shown one at a time; ``content`` are further names of the template.
     """
     sections = [(name, [grid for grid in tables if grid.section == name]) for name in SECTIONS]
-    seen, foreseen = ("#{:02x}{:02x}{:02x}".format(*color) for color in (SEEN, FORESEEN))
+    seen, unseen = ("#{:02x}{:02x}{:02x}".format(*color) for color in (SEEN, UNSEEN))
     environment = Environment(
         loader=PackageLoader("gausim.report"), undefined=StrictUndefined, trim_blocks=True, autoescape=True
     )
@@ -127,7 +127,7 @@ def _page(study: Study, tables: Sequence[Grid], openings: Sequence[Opening], **c
         grouped=grouped,
         cell_texts=cell_texts,
         seen_color=seen,
-        foreseen_color=foreseen,
+        unseen_color=unseen,
     )
 
 

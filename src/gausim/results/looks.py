@@ -45,7 +45,9 @@ def read_looks(path: Path) -> Looks | None:
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Looks)
     except (OSError, msgspec.MsgspecError) as error:
-        raise RunError(f"{path}: expected the looks at the test part, cannot be read ({error}). Restore it.") from error
+        raise RunError(
+            f"{path}: expected the record of test evaluations, cannot be read ({error}). Restore it."
+        ) from error
     if found.schema != SCHEMA or found.looks != len(found.history) or not found.history:
         raise RunError(
             f"{path}: expected schema {SCHEMA!r} and as many entries of 'history' as 'looks', got {found.schema!r} and "

@@ -82,9 +82,7 @@ def kept_pictures(run: Path, name: str) -> list[Pictures]:
     """
     path = run / "evaluation" / "pictures.npz"
     if not path.is_file():
-        raise RunError(
-            f"its evaluation kept no pictures (an earlier version did it). Make them with `gausim evaluate {run}`."
-        )
+        raise RunError(f"its evaluation kept no pictures. Make them with `gausim evaluate {run}`.")
     return [item for item in load_pictures(path) if item.object == name]
 
 

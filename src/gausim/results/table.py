@@ -41,7 +41,7 @@ INFORMED: Final = "informed"
 PAPER: Final = "paper"
 SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, first", "unseen_all": "unseen, all"}
 VIEW_TITLES = {"points": "3D, true points", "train": "training views", "heldout": "views never trained on"}
-NO_FORESIGHT = "Does not foresee: its frames after the trained ones repeat what was fitted."
+NO_FORESIGHT = "Does not extrapolate: its frames after the trained ones repeat what was fitted."
 
 
 class Entry(msgspec.Struct, array_like=True, frozen=True):

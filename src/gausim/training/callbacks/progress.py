@@ -72,7 +72,7 @@ class EpochSummary(Callback):
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
-            "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
+            "loss_image": "loss {:.4g}", "excess_static": "loss/static {:.3f}", "ratio_first": "first frame {:.3f}",
             "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
@@ -114,5 +114,5 @@ class Progress(RichProgressBar):
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """T, the loss against the static prediction's, and the motion energy."""
         stats = getattr(pl_module, "last_stats", {})
-        names = {"steps": "T", "excess_static": "of static", "motion_energy": "motion"}
+        names = {"steps": "T", "excess_static": "loss/static", "motion_energy": "motion"}
         return {label: short(stats[name]) for name, label in names.items() if name in stats}
