@@ -49,7 +49,7 @@ test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	$(ONE_THREAD) $(BIN)/python -m pytest -p nbmake --nbmake --nbmake-timeout=600 notebooks
 
 docs: install results ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
-	$(BIN)/python -c "import material" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	$(BIN)/python -c "import material, mkdocstrings" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 results: install ## Make docs/results.md from its records (docs/results/, which `gausim report DIR --record` writes)

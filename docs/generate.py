@@ -1,11 +1,17 @@
-"""A hook of MkDocs: writes the references of the configuration (from conf/) and of the commands (from their --help)."""
+"""A hook of MkDocs: generates the references of configuration and commands, and all tables of the results.
+
+Configurations come from ``conf/``, commands from their ``--help``, tables and downloads from ``docs/results/``.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import importlib
+import inspect
 import io
 import os
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,10 +21,14 @@ from typing import Any
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from msgspec.structs import astuple
 
 from gausim.cli.main import COMMANDS, command
 from gausim.cli.prepare import STAGES
 from gausim.compose.root import conf_dir, options
+from gausim.report.layouts import layout
+from gausim.results.pivot import Pivot, markdown_table
+from gausim.results.table import Entry, Results, load_results
 
 # Files of these groups set keys of any other group: one table each, of what they set.
 RECIPES = {"experiment": "Experiments", "ablation": "Ablations"}
@@ -30,7 +40,44 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the generated pages to those of docs/."""
     for name, text in (("configuration", configuration()), ("commands", commands())):
         files.append(File.generated(config, f"reference/{name}.md", content=text))
+    records = {path.stem: load_results(path) for path in sorted((ROOT / "docs" / "results").glob("*.json"))}
+    files.append(File.generated(config, "results/details.md", content=details(records)))
+    for name, record in records.items():
+        files.append(File.generated(config, f"results/{name}.csv", content=csv_of(record)))
     return files
+
+
+def details(records: dict[str, Results]) -> str:
+    """The page of all tables of all records, with commits and commands."""
+    parts = [
+        "# All tables",
+        "Every record of [results](../results.md) with deviations, commits and commands. ± is the deviation over "
+        "seeds, in brackets that over sequences. The commands are those of the commits that made the record.",
+    ]
+    for name, record in records.items():
+        pivot, made = Pivot(record), record.made
+        parts += [f"## {name}", f"{record.title}. Download: [CSV]({name}.csv), [JSON]({name}.json)."]
+        if made:
+            machine = "; ".join(made.hardware)
+            parts += [made.test, f"Commits {', '.join(made.commits)}; recorded {made.recorded}; {machine}."]
+        for thing, info in record.objects.items():
+            kinds = ("comparison", "ahead", "ablations", "bounce", "motion") if info.splits else ("",)
+            kinds += tuple(f"{split} {views}" for split in info.splits for views in ("points", "train", "heldout"))
+            for kind in kinds:
+                grid = layout(pivot, thing, kind)
+                parts += [] if grid is None else [f"**{thing}** {kind}", markdown_table(grid)]
+        if made and made.commands:
+            parts.append("```text\n" + "\n".join(made.commands) + "\n```")
+    return "\n\n".join(filter(None, parts))
+
+
+def csv_of(record: Results) -> str:
+    """The long table of a record: a line per figure and seed."""
+    lines = io.StringIO()
+    writer = csv.writer(lines)
+    writer.writerow(Entry.__struct_fields__)
+    writer.writerows(astuple(entry) for entry in record.table)
+    return lines.getvalue()
 
 
 def configuration() -> str:
@@ -56,12 +103,54 @@ def configuration() -> str:
 def _file(name: str) -> Iterator[str]:
     """Head comment and table of one file's keys."""
     path = conf_dir() / name
-    node, comments = yaml.safe_load(path.read_text()) or {}, _comments(path)
+    node, comments = yaml.safe_load(path.read_text()) or {}, _meanings(path)
     yield _head(path)
     inherited = ", ".join(_begins_with(node))
     yield f"It begins with {inherited}." if inherited else ""
-    rows = [(f"`{key}`", f"`{value}`", _cell(comments.get(key, ""))) for key, value in _flat(node)]
+    rows = []
+    for key, value in _flat(node):  # a key without a meaning of its own has that of its node
+        rows.append((f"`{key}`", f"`{value}`", _cell(comments.get(key) or comments.get(key.rpartition(".")[0], ""))))
     yield from _table(("key", "value", "meaning"), rows)
+
+
+def _meanings(path: Path) -> dict[str, str]:
+    """What the keys of a file mean, by their whole names.
+
+    The comment behind a key, else that in the file that this one begins with, else the documentation of the class.
+    """
+    node = yaml.safe_load(path.read_text()) or {}
+    names = [entry.split("@")[0] for entry in node.get("defaults", []) if isinstance(entry, str)]
+    bases = [(conf_dir() / name[1:] if name[0] == "/" else path.parent / name).with_suffix(".yaml") for name in names]
+    found: dict[str, str] = {}
+    for base in filter(Path.is_file, bases):
+        found |= _meanings(base)
+    found |= {key: text for key, text in _documented(node).items() if not found.get(key)}
+    return found | {key: text for key, text in _comments(path).items() if text}
+
+
+def _documented(node: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """What the documentation of the classes says of their arguments, by the keys' whole names."""
+    found: dict[str, str] = {}
+    for key, value in node.items():
+        if key == "_target_":
+            target = pkgutil.resolve_name(re.sub(r"\.(\w+)$", r":\1", value))
+            texts, summary = _arguments(target), (inspect.getdoc(target) or "").split("\n\n")[0]
+            found[f"{prefix}_target_"] = "builds: " + " ".join(summary.split()).rstrip(".")
+            found |= {prefix + name: text for name, text in texts.items() if name in node}
+        elif isinstance(value, dict):
+            found |= _documented(value, f"{prefix}{key}.")
+    return found
+
+
+def _arguments(target: Any) -> dict[str, str]:
+    """The arguments and attributes that a class or function documents, in Google's form, by name."""
+    found: dict[str, str] = {}
+    for owner in (target, getattr(target, "__init__", None)):
+        doc = inspect.getdoc(owner) or ""
+        for section in re.findall(r"(?ms)^(?:Args|Attributes|Options):\n((?:[ ]{4}.*\n?|\n)+)", doc):
+            for name, text in re.findall(r"(?m)^ {4}(\w+): ((?:.*\n?)(?: {8}.*\n?)*)", section):
+                found.setdefault(name, " ".join(text.split()).rstrip("."))
+    return found
 
 
 def _comments(path: Path) -> dict[str, str]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import pkgutil
 import re
 import shlex
+import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from gausim.cli.main import command as command_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SCRIPTS = sorted((ROOT / "docs" / "results" / "commands").glob("*.sh"))
 NAMES_PAGES = ("src", "conf", "data_prep", "Makefile", "CHANGELOG.md", "CONTRIBUTING.md", "docker")
 
 
@@ -70,18 +73,86 @@ def test_pages_named_in_code_and_configurations_exist() -> None:
     assert not {(str(path), page) for path, page in named if not (ROOT / page).is_file()}
 
 
-@pytest.mark.slow
-def test_training_commands_of_the_pages_compose() -> None:
+def _composed(argv: list[str]) -> None:
     from gausim.compose.command import jobs_of
     from gausim.compose.config import compose
     from gausim.compose.root import options
 
     known = options("data")
-    for page, (name, *words) in _commands():
-        if page == "docs/results.md":  # its commands are those of the commit that each record names
-            continue
+    asked = [word for word in argv if word not in ("-m", "--cfg", "job")]
+    asked = ["data=object" if w.startswith("data=") and not set(w[5:].split(",")) <= set(known) else w for w in asked]
+    for job in jobs_of(asked):
+        compose(job)
+
+
+@pytest.mark.slow
+def test_training_commands_of_the_pages_compose() -> None:
+    for _, (name, *words) in _commands():
         if name == "train" and words and not {"--config-dir", "--shell-completion"} & set(words):
-            asked = [word for word in words if word not in ("-m", "--cfg", "job")]
-            asked = ["data=object" if w.startswith("data=") and w[5:] not in known else w for w in asked]
-            for job in jobs_of(asked):
-                compose(job)
+            _composed(words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_scripts_of_the_tables_name_commands_options_and_keys_that_exist(script: Path, tmp_path: Path) -> None:
+    stub = '#!/bin/sh\nfor word in "$@"; do printf "%s\\0" "$word"; done >> "$CALLS"; printf "\\n" >> "$CALLS"\n'
+    for name in ("gausim", "make", "python"):
+        (tmp_path / name).write_text(stub)
+        (tmp_path / name).chmod(0o755)
+    calls = tmp_path / "calls"
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(
+        ["bash", str(script)], check=True, cwd=tmp_path, env=os.environ | {"PATH": path, "CALLS": str(calls)}
+    )
+    lines = [line.rstrip("\0").split("\0") for line in calls.read_text().splitlines()]
+    assert lines
+    for name, *words in lines:
+        if name == "train":
+            _composed(words)
+        elif name in COMMANDS:
+            text = _help(name, *words[: 1 if name == "prepare" else 0])
+            options = {word.split("=")[0] for word in words if word.startswith("--")}
+            assert all(re.search(rf"(?<![\w-]){option}(?![\w-])", text) for option in options), (name, words)
+
+
+# What stands for something in the pages, and options that make every command small.
+RUN = "outputs/mine/seed_0"
+STANDS_FOR = {
+    "MINE": "data/pudding_soft", "MINE/scene.ply": "data/pudding_soft/scene.ply", "NEW": "data/pudding_soft", "RUN": RUN,
+    "RUN2": RUN, "SCENE.ply": "data/pudding_soft/scene.ply", "data=MINE": "data=data/pudding_soft", "seed=0,1,2": "seed=0",
+    "push.json": f"{RUN}/simulation/pudding_soft/forces/session.json", "--format FORMAT": "--format ply",
+    "outputs/demo/seed_0": RUN, "outputs/pretrain/seed_0": RUN, "DIR…": RUN,
+}  # fmt: skip
+SMALL = {
+    "train": ["plan.epochs=1", "plan.repeats=1", "plan.t_max=3", "plan.warm_start.updates=3", "trainer.panel_epochs=0"],
+    "reconstruct": ["--kernels", "80", "--iterations", "40"], "view": ["--seconds", "1", "--port", "0"],
+    "adapt": ["--epochs", "1", "--overwrite"],
+}  # fmt: skip
+RUNNABLE = ("README.md", "docs/tutorials/own-object.md", "docs/tutorials/pushing.md", "docs/how-to/export.md",
+            "docs/how-to/own-splat.md")  # fmt: skip
+
+
+@pytest.mark.slow
+def test_command_blocks_of_readme_tutorials_and_how_tos_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order of the pages, on a tiny object; what needs a network, a GPU, films or minutes is left out."""
+    from data_prep.synthesize import main as synthesize
+    from gausim.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+    tiny = (
+        "--quick --objects pudding_soft --sequences 2 --frames 20 --kernels 80 --resolution 32 --workers 1 --out data"
+    )
+    assert synthesize(tiny.split()) == 0
+    done = 0
+    for page in RUNNABLE:
+        text = (ROOT / page).read_text().replace("\\\n", " ")
+        for line in re.findall(r"^ {4}(gausim .*)", text, re.MULTILINE):
+            name, *words = [STANDS_FOR.get(word, word) for word in shlex.split(line, comments=True)[1:]]
+            if name == "export" and "FORMAT" in words:
+                continue
+            if name == "train" and Path(RUN, "FINISHED").is_file() and "name=mine" in words:
+                continue  # the tutorial repeats README's training
+            status = main([name, *words, *SMALL.get(name, [])])
+            assert status in ((0, 1) if name in ("verify", "doctor") else (0,)), (page, line)
+            done += 1
+    assert done > 20

@@ -21,7 +21,7 @@ from gausim.ops.orbit import orbit_cameras
 
 
 def positions_in(path: Path, scene: GaussianScene) -> torch.Tensor:
-    """Positions of all kernels in all frames as docs/reference/files.md describes them, after a check of the rest."""
+    """Positions of all kernels in all frames, as docs/reference/motion-file.md describes them; the rest is checked."""
     glb = GlbFile(path)
     facts = glb.document["extras"][KEY]
     glb.check_splats(scene, degree=0)

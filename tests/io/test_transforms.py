@@ -182,7 +182,7 @@ def test_fields_of_no_effect_change_nothing(tmp_path: Path, field: str) -> None:
 
 
 def test_the_reference_lists_every_field() -> None:
-    page = (Path(__file__).parents[2] / "docs/reference/files.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/reference/data-set.md").read_text()
     rows = [line for line in page.splitlines() if line.startswith("| `")]
     for field in (*REFUSED, *(f for f in DISTORTION if f[0] == "p")):
         assert any(f"`{field}`" in row and "refused" in row for row in rows), field

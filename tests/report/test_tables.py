@@ -338,12 +338,11 @@ def test_the_page_of_results_is_what_its_records_give() -> None:
 
 
 def test_the_table_of_the_readme_is_of_the_record() -> None:
-    """Its rows are some of the record's, in the record's order."""
     found = re.search(r"\[start:results\] -->\n(\|.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL)
-    grid = summary(Pivot(load_results(ROOT / "docs" / "results" / "comparison.json")))
-    assert found is not None and grid is not None
-    lines, whole = found[1].splitlines(), markdown_table(grid).splitlines()
-    assert lines[:2] == whole[:2] and len(lines) > 4 and lines == [line for line in whole if line in lines]
+    assert found is not None
+    rows = [line.split("|")[1].strip() for line in found[1].splitlines()[2:]]
+    grid = summary(Pivot(load_results(ROOT / "docs" / "results" / "comparison.json")), rows)
+    assert len(rows) > 4 and grid is not None and found[1] == markdown_table(grid)
 
 
 def test_no_figure_is_typed_into_the_template() -> None:

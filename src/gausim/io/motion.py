@@ -2,7 +2,7 @@
 
 Every kernel follows exactly one unit, x_k = x_c + G_c (X_k - X_c) with covariance G_c S_k G_c^T, so that the units'
 centres and deformation gradients are the whole motion. A reader of glTF shows the rest scene with its base colours; the
-motion is in ``extras.gausim_motion``, see docs/reference/files.md for the layout.
+motion is in ``extras.gausim_motion``, see docs/reference/motion-file.md for the layout.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class GsplatRenderer:
         reason = unavailable()
         if reason is not None:
             raise ConfigError(
-                f"render=gsplat: {reason}. See docs/how-to/clusters-and-gpus.md, or let render=auto choose what this "
+                f"render=gsplat: {reason}. See docs/how-to/gpus-and-clusters.md, or let render=auto choose what this "
                 "machine can do."
             )
         from gsplat import rasterization

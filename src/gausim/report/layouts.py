@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -101,21 +102,49 @@ def _is_left_out(metric: str) -> bool:
     return metric in (ERROR_3D, EFFECT, EFFECT_SIGMA) or (metric.endswith(RATIO) and metric != ERROR_RATIO)
 
 
-def summary(pivot: Pivot) -> Grid | None:
-    """A few columns per object, of unseen frames, by rows of methods; None for a single object."""
+def summary(pivot: Pivot, rows: Sequence[str] | None = None) -> Grid | None:
+    """Declared trials, and a few columns per object, of unseen frames, by rows of methods; None for a single object."""
     names = [name for name, info in pivot.results.objects.items() if "unseen" in info.splits]
+    methods = [row for row, kind in pivot.rows(names).items() if kind == "method"]
+    chosen = methods if rows is None else [row for row in rows if row in methods]
+    grid = compact(pivot, names, [f"{metric} {views} unseen" for metric, views in _SUMMARY], chosen)
+    if grid is None or len(names) < 2:
+        return None
+    trials = declared_trials(pivot)
+    if trials:
+        cells = [Cell(float(trials[line.label])) if line.label in trials else None for line in grid.lines]
+        lines = tuple(
+            replace(line, cells=(cell, *line.cells), best=(False, *line.best))
+            for line, cell in zip(grid.lines, cells, strict=True)
+        )
+        grid = replace(grid, columns=(Column(("", "", "", "trials"), "trials", 0), *grid.columns), lines=lines)
+    return replace(grid, title="Unseen frames", caption="Means over seeds and sequences.", section=COMPARISON)
+
+
+def compact(
+    pivot: Pivot, names: Sequence[str], places: Sequence[str], rows: Sequence[str] | None = None, stub: str = "method"
+) -> Grid | None:
+    """Means without deviations and with one digit less, of several objects: columns of ``METRIC VIEWS SPLIT``."""
     columns = []
     for name in names:
-        for metric, views in _SUMMARY:
-            column = pivot.column((name, "unseen", views, metric))
-            columns += [None if column is None else replace(column, label=f"{name}: {column.label}")]
-    methods = [row for row, kind in pivot.rows(names).items() if kind == "method"]
-    grid = pivot.grid(columns, rows=methods, title="Unseen frames", caption="Means over seeds and sequences.")
-    if grid is None or len(names) < 2:
+        for metric, views, split in (place.split() for place in places):
+            column = pivot.column((name, split, views, metric))
+            if column is not None:
+                label = f"{name}: {column.label}" if len(names) > 1 else column.label
+                digits = None if column.digits is None else max(column.digits - 1, 1)
+                columns.append(replace(column, label=label, digits=digits))
+    grid = pivot.grid(columns, rows=rows, stub=stub)
+    if grid is None:
         return None
     lines = [replace(line, cells=tuple(c and c._replace(seed_std=None, std=None) for c in line.cells))
              for line in grid.lines]  # fmt: skip
-    return replace(grid, lines=tuple(lines), section=COMPARISON)
+    return replace(grid, lines=tuple(lines))
+
+
+def declared_trials(pivot: Pivot) -> dict[str, int]:
+    """Trials on the development part that a record's test evaluations declare, by method."""
+    made = pivot.results.made
+    return {row: int(count) for row, count in re.findall(r"(\w+): (\d+) trials?\b", made.test if made else "")}
 
 
 def grids(study: Study) -> list[Grid]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, StrictUndefined, TemplateError
 
 from gausim.core import RunError
-from gausim.report.layouts import layout, summary
+from gausim.report.layouts import compact, layout, summary
 from gausim.results.pivot import Grid, Pivot, markdown_table, texts
 from gausim.results.table import Made, Results, load_results
 
@@ -102,8 +102,9 @@ def page(folder: Path) -> str:
     """The page of ``folder/page.md``, a template that names tables and facts of the records ``folder/*.json``.
 
     In the template ``table("RECORD", "OBJECT", "KIND")`` is a table of an object (see
-    :func:`gausim.report.layouts.layout`; ``stub`` is the heading of its labels), ``summary("RECORD")`` that of all
-    objects, ``made("RECORD")`` commits and commands of the record, and ``RECORD.NAME`` a fact.
+    :func:`gausim.report.layouts.layout`; ``stub`` is the heading of its labels), ``summary("RECORD", ROWS)`` that of
+    all objects, ``compact("RECORD", OBJECTS, PLACES, ROWS)`` means of several objects, ``number("RECORD", ROW, OBJECT,
+    METRIC, VIEWS, SPLIT)`` one mean, ``made("RECORD")`` commits and commands of the record, ``RECORD.NAME`` a fact.
 
     Raises:
         RunError: the template or a record is missing or malformed, or names something that is not there.
@@ -123,6 +124,12 @@ def page(folder: Path) -> str:
             raise RunError(f"{folder / TEMPLATE}: record '{record}' has no object '{name}', expected one of {told}.")
         return _shown(layout(pivot, name, kind, stub=stub), f"'{kind}' of {name} in the record '{record}'")
 
+    def number(record: str, row: str, name: str, metric: str, views: str = "", split: str = "", digits: int = 2) -> str:
+        value = known(record).number(row, (name, split, views, metric))
+        if value is None:
+            raise RunError(f"{folder / TEMPLATE}: record '{record}' has no {metric} {views} {split} of {row}, {name}.")
+        return f"{value:,.{digits}f}"
+
     def _shown(grid: Grid | None, what: str) -> str:
         if grid is None:
             raise RunError(f"{folder / TEMPLATE}: there are no figures for {what}.")
@@ -136,7 +143,11 @@ def page(folder: Path) -> str:
     )
     environment.globals = {
         "table": table,
-        "summary": lambda name: _shown(summary(known(name)), f"a summary of the record '{name}'"),
+        "number": number,
+        "summary": lambda name, rows=None: _shown(summary(known(name), rows), f"a summary of the record '{name}'"),
+        "compact": lambda name, *arguments, **options: _shown(
+            compact(known(name), *arguments, **options), f"a compact table of the record '{name}'"
+        ),
         "made": lambda name: _block(known(name).results),
         **{name: {key: _fact(fact) for key, fact in p.results.facts.items()} for name, p in pivots.items()},
     }

@@ -111,7 +111,7 @@ def joined(layout: Layout) -> Iterator[None]:
         words = (str(error) or type(error).__name__).splitlines()[0]
         raise RunError(
             f"the connection to the other ranks is lost ({words}). One of them has ended or did not answer in "
-            "time; its output tells why. The last checkpoint, if any, is unharmed; the same command "
+            "time; its output states the reason. The last checkpoint, if any, is unharmed; the same command "
             "continues from it."
         ) from error
     finally:
@@ -140,7 +140,7 @@ def _check(layout: Layout) -> None:
     elif layout.num_nodes > 1:
         raise ConfigError(
             f"trainer.num_nodes: {layout.num_nodes} machines need a scheduler that starts the ranks (SLURM with one "
-            "task per rank, or torchrun), found none. See docs/how-to/clusters-and-gpus.md."
+            "task per rank, or torchrun), found none. See docs/how-to/gpus-and-clusters.md."
         )
     else:
         return
