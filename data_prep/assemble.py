@@ -1,4 +1,4 @@
-"""Puts stills, sequences and the scene of one object into one directory, with ``dataset.json``, ready for training.
+"""Put stills, sequences and the scene of one object into one directory, with ``dataset.json``, ready for training.
 
 PICTURES are results of `segment` (or of `poses`, where the pictures had alpha already, or of `public`): posed
 stills become OUT/static, posed sequences OUT/sequences. Of several folders the later one replaces what the earlier ones
@@ -43,10 +43,10 @@ class AssembleOptions(Options):
 
     name: str | None = option(None, "of the object (the result's folder)")
     fps: float | None = option(
-        None, "frames per second (what transforms.json of the sequences says)", least=1e-3, most=1e4
+        None, "state the frames per second (default: as transforms.json of the sequences)", least=1e-3, most=1e4
     )
     heldout: tuple[str, ...] | None = option(
-        None, "cameras never to train on, or 'none' (the last of three or more)", type=names, metavar="CAM,CAM"
+        None, "never train on these cameras, or 'none' (the last of three or more)", type=names, metavar="CAM,CAM"
     )
     train_frames: int | None = option(
         None, f"first frames to train on ({TRAIN_FRAMES}, or the shortest sequence)", least=2, metavar="N"
@@ -141,7 +141,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "pictures", type=Path, nargs="+", metavar="PICTURES", help="folders with posed RGBA stills and sequences"
     )
-    parser.add_argument("--scene", type=Path, metavar="SCENE", help="rest scene (PLY, masks beside it), or its folder")
+    parser.add_argument(
+        "--scene", type=Path, metavar="SCENE", help="take this rest scene (PLY, masks beside it), or its folder"
+    )
     add_options(parser.add_argument_group("what the pictures do not say"), AssembleOptions)
 
     def run(given: argparse.Namespace, tick: Tick) -> str:

@@ -1,4 +1,4 @@
-"""Makes the paper's synthetic set with Blender: an elastic object, set off by pokes and drags, filmed all around.
+"""Make the paper's synthetic set with Blender: an elastic object, set off by pokes and drags, filmed all around.
 
 Any OBJ or PLY mesh will do. Blender's soft body moves it and Cycles renders it, in a Python environment of their own
 (where it is missing, the command says how to make it). What was interrupted goes on picture by picture; the same
@@ -47,19 +47,19 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = stage_parser("blender_bunny", __doc__, result=False)
     add = parser.add_argument
-    add("--mesh", type=Path, required=True, metavar="FILE", help="surface of the object, OBJ or PLY")
-    add("--out", type=Path, metavar="DIR", help="where to (default: data/NAME)")
+    add("--mesh", type=Path, required=True, metavar="FILE", help="take this surface of the object, OBJ or PLY")
+    add("--out", type=Path, metavar="DIR", help="write to this folder (default: data/NAME)")
     add("--overwrite", action="store_true", help="replace a set of other settings")
-    add("--quick", action="store_true", help="2 sequences of 8 small frames, 4 views, 6 stills")
+    add("--quick", action="store_true", help="make 2 sequences of 8 small frames, 4 views, 6 stills")
     group = parser.add_argument_group("sizes and motion", "Defaults are the paper's.")
     for kind in (Plan, Pictures, Soft):
         add_options(group, kind, unset=True)
     add = parser.add_argument_group("Blender").add_argument
     add(
         "--blender-python", type=Path, default=default_python(), metavar="PATH",
-        help="a Python that has bpy (%(default)s)",
+        help="use this Python, which has bpy (%(default)s)",
     )  # fmt: skip
-    add("--workers", type=int, default=cores(), help="processes at a time (%(default)s)")
+    add("--workers", type=int, default=cores(), help="use so many processes at a time (%(default)s)")
     return run_command(parser, argv, _run)
 
 

@@ -1,4 +1,4 @@
-"""Makes a corpus of random elastic bodies with known motion and material, to learn elasticity from.
+"""Make a corpus of random elastic bodies with known motion and material, to learn elasticity from.
 
 Shapes (blobs, stems, slabs, shells, forks, lattices, rings, figures and any mesh), materials, pins, pushes and frame
 rates are random; MuJoCo's finite elements move the bodies, and the material point method a fraction of them. There are
@@ -81,7 +81,7 @@ def _write_body(work: Path, plan: Plan, number: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = stage_parser("corpus", __doc__)
-    parser.add_argument("--workers", type=int, default=cores(), help="processes (%(default)s)")
+    parser.add_argument("--workers", type=int, default=cores(), help="use so many processes (%(default)s)")
     parser.add_argument("--sheet", action="store_true", help="draw a contact sheet of the corpus, OUT/sheet.png")
     add_options(parser, Plan)
     return run_command(parser, argv, _run)

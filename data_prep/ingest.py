@@ -1,4 +1,4 @@
-"""Several cameras' films of each sequence to synchronised, lossless frames.
+"""Synchronise several cameras' films of each sequence into lossless frames.
 
 Cameras are put on one clock by their sound, else by a flash that all saw, else by given offsets; a camera that ends up
 more than half a frame from where it should be is refused by name. The output is sequences/seq_000/cam_0/0000.png and
@@ -49,15 +49,19 @@ def _offsets(text: str) -> dict[str, str]:
 class IngestOptions(Options):
     """Settings of synchronisation and of the frames that are written."""
 
-    sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=("auto", *METHODS))
+    sync: str = option(
+        "auto",
+        "synchronise by this method; auto takes the first that applies (%(default)s)",
+        choices=("auto", *METHODS),
+    )
     offsets: Mapping[str, str] | None = option(
-        None, "how much later cameras began, in every sequence: seconds, or 7.3f in frames",
+        None, "state how much later cameras began, in every sequence: seconds, or 7.3f in frames",
         type=_offsets, metavar="CAM=X,CAM=X",
     )  # fmt: skip
     reference: str | None = option(
-        None, "camera whose frames give the times (the one with the smallest residuals)", metavar="CAM"
+        None, "take the times of this camera's frames (the one with the smallest residuals)", metavar="CAM"
     )
-    fps: str | None = option(None, "output rate, of which all cameras' rates are multiples (the slowest camera's)")
+    fps: str | None = option(None, "write this rate, of which all cameras' rates are multiples (the slowest camera's)")
     start: float = option(0.0, "leave out so much of the common time [s] (%(default)s)", least=0)
     duration: float | None = option(None, "keep so much of it [s] (all)", least=0)
     max_side: int | None = option(None, "reduce larger pictures to this [pixels]", least=1)

@@ -1,4 +1,4 @@
-"""Packs an object's sequences for streaming: only the foreground's part of each view, as bytes that need no decoding.
+"""Pack an object's sequences for streaming: only the foreground's part of each view, as bytes that need no decoding.
 
 STORE, the result, is a data set of its own, which every command takes; frames are
 read from it where they lie, so that training never holds it in memory. ``gausim verify STORE`` checks it.
@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("root", type=Path, metavar="ROOT", help="directory of the object (dataset.json, sequences/)")
     parser.add_argument(
         "--margin", type=int, default=2, metavar="PIXELS",
-        help="transparent pixels kept around what the foreground touches (default: %(default)s)",
+        help="keep so many transparent pixels around what the foreground touches (default: %(default)s)",
     )  # fmt: skip
 
     def run(given: argparse.Namespace, tick: Tick) -> str:

@@ -1,4 +1,4 @@
-"""Poses of photos and of fixed video cameras: found with COLMAP, or taken over from somebody who found them.
+"""Find the poses of photos and of fixed video cameras with COLMAP, or take them over.
 
 The result is OUT/transforms.json with undistorted images/*.png (camera to world, OpenGL axes), points.npz (points,
 colours, errors) to begin a reconstruction with, cameras.png to look at, and for videos sequences/SEQ/transforms.json

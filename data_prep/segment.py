@@ -1,4 +1,4 @@
-"""Foreground masks: pictures or films to RGBA with straight alpha, and overlays to check them by eye.
+"""Cut the object out of pictures or films: RGBA with straight alpha, and overlays to check by eye.
 
 Run ``gausim prepare segment PICTURES --out OUT --backend …`` on a folder of pictures, on what ``ingest`` made, or
 on a film. Every picture becomes a PNG of the same name and folder whose alpha is the mask; overlays/ holds a film, a
@@ -191,10 +191,11 @@ def main(argv: list[str] | None = None) -> int:
     parser = stage_parser("segment", __doc__)
     add = parser.add_argument
     add("pictures", type=Path, metavar="PICTURES", help="folder of pictures, a result of ingest, or a film")
-    add("--backend", choices=BACKENDS, required=True, help="what makes the masks")
-    add("--every", type=int, default=1, metavar="N", help="only each N-th picture, to try out (%(default)s)")
+    add("--backend", choices=BACKENDS, required=True, help="make the masks in this way")
+    add("--every", type=int, default=1, metavar="N", help="take each N-th picture only, to try out (%(default)s)")
     add("--kind", choices=("auto", "film", "stills"), default="auto",
-        help="film: a camera that stands still; auto: films, and folders in sequences/ (%(default)s)")  # fmt: skip
+        help="treat the pictures as a film of a camera that stands still, or as stills; auto: films, and folders in "
+        "sequences/ (%(default)s)")  # fmt: skip
     add_options(parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)"), Cleanup, unset=True)
     add_options(parser.add_argument_group("backends masks, background and chroma"), ScreenOptions)
 

@@ -1,4 +1,4 @@
-"""Marks the kernels of a scene that are simulated, pinned and shown in the videos, and draws what was marked.
+"""Mark the kernels of a scene that are simulated, pinned and shown in the videos, and draws what was marked.
 
 A selection is a text, read from left to right:
   --simulated "near moving.ply 0.01"            within 0.01 of a point of an npz, ply or txt
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
 MASKS = {
-    "simulated": "kernels that may move",
-    "pinned": "simulated kernels that are held",
-    "foreground": "kernels that are compared with segmented video",
+    "simulated": "let these kernels move",
+    "pinned": "pin these simulated kernels",
+    "foreground": "compare these kernels with segmented video",
 }
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
 # Selected kernels are drawn half in this colour (RGB), the others grey.
@@ -123,11 +123,13 @@ def main(argv: list[str] | None = None) -> int:
     group = parser.add_argument_group("masks (those not given stay as they are)")
     for name, what in MASKS.items():
         group.add_argument(f"--{name}", metavar="SELECTION", help=what)
-    group.add_argument("--masks", type=Path, metavar="FILE", help="masks so far; default <stem>.masks.npz, if there")
+    group.add_argument(
+        "--masks", type=Path, metavar="FILE", help="start from these masks (default: <stem>.masks.npz, if there)"
+    )
     group = parser.add_argument_group("picture")
     group.add_argument("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z",
-        help="axis drawn upwards (write --up=-y; default %(default)s)")  # fmt: skip
-    group.add_argument("--size", type=int, default=360, help="of each view [pixels] (%(default)s)")
+        help="draw this axis upwards (write --up=-y; default %(default)s)")  # fmt: skip
+    group.add_argument("--size", type=int, default=360, help="draw each view in this size [pixels] (%(default)s)")
 
     def run(given: argparse.Namespace, tick: Tick) -> str:
         selections = {name: getattr(given, name) for name in MASKS if getattr(given, name)}

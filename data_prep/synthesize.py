@@ -1,4 +1,4 @@
-"""Makes the embedded synthetic data set: elastic puddings and flowers, filmed by several cameras.
+"""Make the embedded synthetic data set: elastic puddings and flowers, filmed by several cameras.
 
 Bodies move by MuJoCo's finite elements (none of gausim's own models), carry Gaussians in their cells, and are
 photographed by the compiled renderer. Everything follows from the settings and the seed; a set that is already there
@@ -60,10 +60,10 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = stage_parser("synthesize", __doc__, result=False)
     add = parser.add_argument
-    add("--out", type=Path, default=Path("data/synthetic"), help="folder of the set (%(default)s)")
+    add("--out", type=Path, default=Path("data/synthetic"), help="write the set to this folder (%(default)s)")
     add("--overwrite", action="store_true", help="replace a set of other settings")
-    add("--quick", action="store_true", help="a tiny set, for tests")
-    add("--workers", type=int, default=cores(), help="processes (%(default)s)")
+    add("--quick", action="store_true", help="make a tiny set, for tests")
+    add("--workers", type=int, default=cores(), help="use so many processes (%(default)s)")
     add_options(parser, Plan, unset=True)
     return run_command(parser, argv, _run)
 

@@ -124,3 +124,15 @@ def test_messages() -> None:
 def test_the_checks_find_what_they_look_for() -> None:
     assert faults("an error of .36 of static") and faults("It foresees the frames.") and not faults("an error of 0.36")
     assert mean_length("One two three four. Five six seven eight nine ten.") == 5
+
+
+def test_options_begin_with_a_verb() -> None:
+    """No option of the commands begins as a description does: with a preposition, an article or a plural noun."""
+    described = r"(?:of|a|an|the|its|with|for|behind|instead|also|number|default|folder|frames|fraction|size)\b"
+    wrong = {}
+    for name, text in _help():
+        options = text.partition("options:")[2]
+        found = re.findall(rf"(?m)^  (--[\w-]+(?: [^\n]*?)?)(?:  +|\n {{8,}}){described}", options)
+        if found:
+            wrong[name] = found
+    assert not wrong

@@ -38,45 +38,54 @@ TRAIN_ELEVATIONS, HELDOUT_ELEVATION, STILL_ELEVATION = (18.0, 22.0, 16.0, 24.0),
 class Pictures(Options):
     """Stills and sizes of a set."""
 
-    stills: int = option(200, "pictures of the rest state (200)", least=1, most=10000)
+    stills: int = option(200, "make so many pictures of the rest state (200)", least=1, most=10000)
     resolution: tuple[int, int] = option(
-        (540, 960), "of the sequences [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+        (540, 960),
+        "draw the sequences in this size [pixels] (540 960)",
+        least=8,
+        most=8192,
+        nargs=2,
+        metavar=("W", "H"),
     )
     still_resolution: tuple[int, int] = option(
-        (540, 960), "of the stills [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+        (540, 960), "draw the stills in this size [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
     )
-    samples: int = option(16, "light paths per pixel (16)", least=1, most=65536)
+    samples: int = option(16, "trace so many light paths per pixel (16)", least=1, most=65536)
 
 
 @dataclass(frozen=True)
 class Soft(Options):
     """The soft body that moves the object."""
 
-    stiffness: float = option(0.7, "of the soft body's springs, below 1 (default: 0.7)", least=0.05, most=0.999)
-    bend: float = option(5.0, "resistance to bending (default: 5)", least=0, most=10)
-    damping: float = option(0.02, "of vibrations (default: 0.02)", least=0, most=50)
-    speed: float = option(0.11, "of time in the soft body (default: 0.11)", least=0.02, most=1)
-    steps: int = option(30, "least steps per 1/192 s; more lose less energy (default: 30)", least=1, most=1000)
+    stiffness: float = option(
+        0.7, "give the soft body's springs this stiffness, below 1 (default: 0.7)", least=0.05, most=0.999
+    )
+    bend: float = option(5.0, "give it this resistance to bending (default: 5)", least=0, most=10)
+    damping: float = option(0.02, "damp vibrations by this (default: 0.02)", least=0, most=50)
+    speed: float = option(0.11, "run time in the soft body at this speed (default: 0.11)", least=0.02, most=1)
+    steps: int = option(
+        30, "make at least so many steps per 1/192 s; more lose less energy (default: 30)", least=1, most=1000
+    )
 
 
 @dataclass(frozen=True)
 class Plan(Options):
     """Sizes and settings of a set; the defaults are the paper's synthetic set."""
 
-    name: str = option("object", "of the object (default: the mesh file's)")
-    up: str = option("y", "axis of the mesh that points up (default: y)", choices=UP_AXES)
-    sequences: int = option(30, "how many motions (30)", least=1, most=1000)
-    frames: int = option(60, "of each, at 24 per second (60)", least=2, most=10000)
-    views: int = option(5, "cameras; the paper has 4 to 6 (5)", least=1, most=64)
-    heldout: int = option(1, "how many of them are never trained on (1)", least=0, most=63)
-    points: int = option(2048, "vertices whose true motion is stored (2048)", least=1, most=100_000)
+    name: str = option("object", "name the object (default: as the mesh file)")
+    up: str = option("y", "point this axis of the mesh up (default: y)", choices=UP_AXES)
+    sequences: int = option(30, "make so many motions (30)", least=1, most=1000)
+    frames: int = option(60, "make so many frames of each, at 24 per second (60)", least=2, most=10000)
+    views: int = option(5, "film with so many cameras; the paper has 4 to 6 (5)", least=1, most=64)
+    heldout: int = option(1, "never train on so many of them (1)", least=0, most=63)
+    points: int = option(2048, "store the true motion of so many vertices (2048)", least=1, most=100_000)
     amplitude: tuple[float, float] = option(
-        (8.0, 13.0), "largest displacement of a sequence, drawn from this range [%% of the diagonal] (default: 8 13)",
+        (8.0, 13.0), "draw the largest displacement of a sequence from this range [%% of the diagonal] (default: 8 13)",
         least=0.5, most=30, interval=True,
     )  # fmt: skip
     pictures: Pictures = Pictures()
     soft: Soft = Soft()
-    seed: int = option(0, "of everything random (default: 0)", least=0, most=2**31 - 1)
+    seed: int = option(0, "draw everything random with this seed (default: 0)", least=0, most=2**31 - 1)
 
     def __post_init__(self) -> None:
         """Checks the fields, each and together."""

@@ -104,7 +104,7 @@ def stage_parser(name: str, text: str, *, epilog: str | None = None, result: boo
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     if result:
-        parser.add_argument("--out", type=Path, required=True, help="folder of the result")
+        parser.add_argument("--out", type=Path, required=True, help="write the result to this folder")
         parser.add_argument("--overwrite", action="store_true", help="replace a result of other inputs or settings")
     return parser
 

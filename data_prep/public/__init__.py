@@ -1,4 +1,4 @@
-"""Brings public data sets of elastic objects to our layout, checked as `gausim verify` does.
+"""Bring public data sets of elastic objects to our layout, checked as `gausim verify` does.
 
 Gravity, floor and hands come along where a set has them; stills are frame 0 of the cameras where it has none. Objects
 without masks are to be segmented next. What deviates from a set's layout is refused with file and field.
@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
             kind, help=KINDS[kind], description=text, formatter_class=argparse.RawDescriptionHelpFormatter
         )
         part.add_argument("root", type=Path, metavar="ROOT", help="folder in the layout of the set")
-        part.add_argument("--out", type=Path, required=True, help="folder of the result")
+        part.add_argument("--out", type=Path, required=True, help="write the result to this folder")
         part.add_argument("--overwrite", action="store_true", help="replace a result of other inputs or settings")
         add_options(part.add_argument_group("what the set does not say, or may say otherwise"), reader.Options)
 

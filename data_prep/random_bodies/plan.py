@@ -26,30 +26,39 @@ KEPT_SWING, LEAST_VOLUME = (0.015, 0.45), 0.1
 class Plan(Options):
     """Size of a corpus."""
 
-    bodies: int = option(300, "number of bodies (300)", least=1)
-    sequences: int = option(4, "sequences per body (4)", least=1)
-    frames: int = option(50, "frames per sequence (50)", least=2)
+    bodies: int = option(300, "make so many bodies (300)", least=1)
+    sequences: int = option(4, "make so many sequences per body (4)", least=1)
+    frames: int = option(50, "make so many frames per sequence (50)", least=2)
     kernels: tuple[int, int] = option(
-        (400, 800), "fewest and most kernels of a body (400 800)", least=50, interval=True, metavar=("FEWEST", "MOST")
+        (400, 800),
+        "give a body between FEWEST and MOST kernels (400 800)",
+        least=50,
+        interval=True,
+        metavar=("FEWEST", "MOST"),
     )
     cells: tuple[int, int] = option(
-        CELLS, "fewest and most hexahedral cells of a body, each of six linear elements (110 260)", least=50,
+        CELLS, "give a body between FEWEST and MOST hexahedral cells, each of six linear elements (110 260)", least=50,
         interval=True, metavar=("FEWEST", "MOST"),
     )  # fmt: skip
     shapes: tuple[str, ...] = option(
-        SHAPES, f"kinds of shape, each as likely as the others ({' '.join(SHAPES)}); besides these there is: bar",
+        SHAPES, "draw from these kinds of shape, each as likely as the others "
+        f"({' '.join(SHAPES)}); besides these there is: bar",
         nargs="+", choices=(*SHAPES, "bar"), metavar="KIND",
     )  # fmt: skip
     materials: tuple[str, ...] = option(
-        MATERIALS, "kinds of material (even even split smooth): even, split at any plane, smooth, or halves differing "
-        "in stiffness alone", nargs="+", choices=("even", "split", "halves", "smooth"), metavar="KIND",
+        MATERIALS, "draw from these kinds of material (even even split smooth): even, split at any plane, smooth, or "
+        "halves differing in stiffness alone", nargs="+", choices=("even", "split", "halves", "smooth"), metavar="KIND",
     )  # fmt: skip
     swing: tuple[float, float] = option(
-        (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal] (0.02 0.3)", least=1e-3, most=0.4,
-        interval=True,
+        (0.02, 0.3), "push by amplitudes from LOW to HIGH [fractions of the body's diagonal] (0.02 0.3)",
+        least=1e-3, most=0.4, interval=True,
     )  # fmt: skip
-    second: float = option(0.2, "fraction of bodies that the material point method moves (0.2)", least=0, most=1)
+    second: float = option(0.2, "move this fraction of bodies by the material point method (0.2)", least=0, most=1)
     meshes: tuple[Path, ...] = option(
-        (), "surfaces (OBJ or PLY), each as likely as a procedural kind of shape", nargs="+", metavar="FILE", type=Path
+        (),
+        "draw from these surfaces (OBJ or PLY), too, each as likely as a kind of shape",
+        nargs="+",
+        metavar="FILE",
+        type=Path,
     )
-    seed: int = option(0, "of everything random (0)", least=0)
+    seed: int = option(0, "draw everything random with this seed (0)", least=0)

@@ -91,22 +91,22 @@ class Plan(Options):
     """Size of a set; of each object pokes and drags take turns."""
 
     objects: tuple[str, ...] = option(
-        ("pudding_soft", "pudding_firm", "flower_soft", "flower_swing", "pudding_swing"), "only these objects",
+        ("pudding_soft", "pudding_firm", "flower_soft", "flower_swing", "pudding_swing"), "make only these objects",
         type=names, metavar="NAME,NAME",
     )  # fmt: skip
-    sequences: int = option(8, "sequences per object", least=1)
-    frames: int = option(50, "frames per sequence, at least 16", least=TRAIN_FRAMES)
+    sequences: int = option(8, "make so many sequences per object", least=1)
+    frames: int = option(50, "make so many frames per sequence, at least 16", least=TRAIN_FRAMES)
     fps: int = 24
     train_views: int = 4  # a held-out one is added
     stills: int = 24
-    resolution: int = option(96, "of the videos [pixels]", least=1)
+    resolution: int = option(96, "draw the videos in this size [pixels]", least=1)
     still_resolution: int = 192
-    kernels: int = option(800, "Gaussians per object, at least 50", least=50)
+    kernels: int = option(800, "give an object so many Gaussians, at least 50", least=50)
     swing: tuple[float, float] | None = option(
-        None, "amplitude of all pushes [fractions of the object's diagonal]; each object's own unless given",
+        None, "push by amplitudes from LOW to HIGH [fractions of the diagonal]; each object's own unless given",
         least=1e-9, most=LARGEST_SWING, interval=True,
     )  # fmt: skip
-    seed: int = option(0, "of everything random (0)")
+    seed: int = option(0, "draw everything random with this seed (0)")
 
     def __post_init__(self) -> None:
         """Checks the numbers and the names."""

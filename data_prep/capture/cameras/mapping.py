@@ -41,23 +41,31 @@ _WEAKER = 0.5
 class MappingOptions(Options):
     """Settings of the search for poses."""
 
-    camera_model: str = option("SIMPLE_RADIAL", "of COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE ... (%(default)s)")
+    camera_model: str = option(
+        "SIMPLE_RADIAL", "use this camera model of COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE ... (%(default)s)"
+    )
     intrinsics: str = option(
-        "shared", "one lens for all photos of a camera, or per image where it zooms or refocuses (%(default)s)",
+        "shared", "assume one lens for all photos of a camera, or one per image where it zooms (%(default)s)",
         choices=("shared", "per-image"),
     )  # fmt: skip
     focal: float | None = option(
-        None, "focal length where it is known (default: EXIF, else a guess)", least=1e-6, most=1e6, metavar="PIXELS"
+        None, "state the focal length (default: EXIF, else a guess)", least=1e-6, most=1e6, metavar="PIXELS"
     )
     matching: str = option(
-        "exhaustive", "every pair, or each photo with the next ones (%(default)s)", choices=("exhaustive", "sequential")
+        "exhaustive",
+        "match every pair, or each photo with the next ones (%(default)s)",
+        choices=("exhaustive", "sequential"),
     )
-    overlap: int = option(10, "next photos in sequential matching (%(default)s)", least=1, metavar="N")
-    features: int = option(4096, "at most so many per photo (%(default)s)", least=1, metavar="N")
-    feature_size: int = option(1600, "longer side they are found at (%(default)s)", least=64, metavar="PIXELS")
+    overlap: int = option(
+        10, "match with so many next photos, in sequential matching (%(default)s)", least=1, metavar="N"
+    )
+    features: int = option(4096, "take at most so many per photo (%(default)s)", least=1, metavar="N")
+    feature_size: int = option(1600, "detect them at this longer side (%(default)s)", least=64, metavar="PIXELS")
     # Affine features over several sizes, weaker ones too, and a second search for matches.
-    thorough: bool = option(False, "for few photos from places far apart: finds more, takes far longer")
-    threads: int = option(1, "more: faster, repeatable up to rounding (%(default)s)", least=1, metavar="N")
+    thorough: bool = option(False, "detect more, in far longer time, for few photos from places far apart")
+    threads: int = option(
+        1, "use so many threads; several are repeatable up to rounding only (%(default)s)", least=1, metavar="N"
+    )
 
     def __post_init__(self) -> None:
         """Checks names and numbers."""

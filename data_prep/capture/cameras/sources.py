@@ -34,17 +34,19 @@ from gausim.io.plain_json import read_json
 class Sources(Options):
     """Options for the inputs of the poses."""
 
-    images: Path | None = option(None, "photos of the rest state", metavar="DIR")
+    images: Path | None = option(None, "pose these photos of the rest state", metavar="DIR")
     sequences: Path | None = option(
-        None, "result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and its first "
-        "frame shows the rest state", metavar="DIR",
+        None, "pose the result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and "
+        "its first frame shows the rest state", metavar="DIR",
     )  # fmt: skip
-    fps: float | None = option(None, "frames per second of the sequences (default: that of ingest)", metavar="RATE")
+    fps: float | None = option(
+        None, "state the frames per second of the sequences (default: that of ingest)", metavar="RATE"
+    )
     colmap: Path | None = option(
-        None, "COLMAP model to take over, binary or text, for --images of any size", metavar="DIR"
+        None, "take over this COLMAP model, binary or text, for --images of any size", metavar="DIR"
     )
     transforms: Path | None = option(
-        None, "transforms.json to take over, also with OPENCV or OPENCV_FISHEYE distortion", metavar="FILE"
+        None, "take over this transforms.json, also with OPENCV or OPENCV_FISHEYE distortion", metavar="FILE"
     )
 
     def __post_init__(self) -> None:

@@ -46,7 +46,7 @@ class WorldOptions(Options):
         "vector X,Y,Z, or 'keep' (default for poses that are taken over)", metavar="RULE",
     )  # fmt: skip
     scale: float | None = option(
-        None, "size of the new world over that of the found one, such as metres by a length that you know in it "
+        None, "scale the world by this factor, such as metres by a length that you know in it "
         "(default for found poses: the cameras' mean distance from what they look at becomes 1)", least=1e-9, most=1e9,
     )  # fmt: skip
 

@@ -31,11 +31,17 @@ def colour(text: str) -> tuple[int, int, int]:
 class ScreenOptions(Options):
     """Of the backends masks, background and chroma."""
 
-    masks: Path | None = option(None, "masks of another program, folders and names like the pictures'", metavar="DIR")
-    plate: Path | None = option(None, "picture of the empty scene, or a folder with one per camera (cam_0.png)")
-    threshold: float | None = option(None, "difference in CIE Lab that counts (from the noise)", least=0, most=200)
+    masks: Path | None = option(
+        None, "take masks of another program, folders and names like the pictures'", metavar="DIR"
+    )
+    plate: Path | None = option(
+        None, "compare with this picture of the empty scene, or a folder with one per camera (cam_0.png)"
+    )
+    threshold: float | None = option(
+        None, "count differences in CIE Lab above this (from the noise)", least=0, most=200
+    )
     key: tuple[int, int, int] | None = option(
-        None, "colour of the screen (that of the picture's border)", type=colour, metavar="RRGGBB"
+        None, "remove this colour of the screen (that of the picture's border)", type=colour, metavar="RRGGBB"
     )
     no_grabcut: bool = option(False, "leave the masks as the difference gives them")
 

@@ -21,16 +21,16 @@ class Cleanup(Options):
     """Settings of the cleaning of a clip's masks; lengths are fractions of the picture's longer side."""
 
     radius: int = option(
-        2, "neighbours in time on each side to agree with; 0 leaves time alone (2)", least=0, metavar="FRAMES"
+        2, "agree with so many neighbours in time on each side; 0: none (2)", least=0, metavar="FRAMES"
     )
-    motion: float = option(0.02, "how far edges move per frame (0.02)", least=0, most=1)
+    motion: float = option(0.02, "allow edges to move so far per frame (0.02)", least=0, most=1)
     holes: float = option(0.02, "fill holes up to this part of the foreground (0.02)", least=0, most=1)
     components: int = option(1, "keep the N largest parts; 0 keeps all (1)", least=0, metavar="N")
     least: float = option(0.0005, "drop parts below this part of the picture (0.0005)", least=0, most=1)
-    edge: float = option(0.004, "width over which hard edges are softened; 0 leaves them (0.004)", least=0, most=0.1)
-    reach: float = option(0.01, "soft edges end so far from the foreground; 0: anywhere (0.01)", least=0, most=1)
+    edge: float = option(0.004, "soften hard edges over this width; 0: not (0.004)", least=0, most=0.1)
+    reach: float = option(0.01, "end soft edges so far from the foreground; 0: anywhere (0.01)", least=0, most=1)
     # Any alpha above 0 counts as foreground.
-    floor: float = option(0.05, "alpha below this becomes 0 (0.05)", least=0, most=1)
+    floor: float = option(0.05, "set alpha below this to 0 (0.05)", least=0, most=1)
 
 
 UNTOUCHED = Cleanup(radius=0, holes=0.0, components=0, least=0.0, edge=0.0, reach=0.0, floor=0.0)

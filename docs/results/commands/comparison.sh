@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 set -euo pipefail
 # Methods on test parts: two sequences of each object, three minutes of processor time, three seeds. GAUSIM_BUNNY names the bunny.
-export GAUSIM_SYNTHETIC=data/synthetic_110
+export GAUSIM_SYNTHETIC_TEST=data/synthetic_110
 small='data.sequences=[seq_000,seq_001]' large='data.sequences=[seq_010,seq_011]'
 fixed='name=comparison evaluate=true'
 limited="$fixed plan.clock=cpu plan.max_minutes=3 seed=0,1,2"

@@ -32,15 +32,15 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="evaluate the test part; evaluation/test.json counts it",
     )
-    add("--trials", type=positive, metavar="N", help="with --test: declare N trials of the method on the development "
-        "part (default: trials of the run)")  # fmt: skip
-    add("--flip", action="store_true", help="also measure FLIP (extra `flip`), in as much time as all other metrics")
+    add("--trials", type=positive, metavar="N", help="declare N trials of the method on the development "
+        "part, with --test (default: trials of the run)")  # fmt: skip
+    add("--flip", action="store_true", help="measure FLIP, too (extra `flip`), in as much time as all other metrics")
     add_data_option(parser)
     add("--out", metavar="DIR", type=Path, help="write to this folder (default: RUN/evaluation, of a part "
         "RUN/evaluation/partial)")  # fmt: skip
     add(
         "--endurance", type=int, metavar="N",
-        help="also roll N frames far, free and under random pushes in the first 240, and write endurance.json and a "
+        help="roll N frames far, too, free and under random pushes in the first 240, and write endurance.json and a "
         "figure per object (at least 300, e.g. 1000; default: none)",
     )  # fmt: skip
     add_device_options(parser)

@@ -46,8 +46,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("fetch", " The zip archive is unpacked only if its hash is right.")
     add = parser.add_argument
     add("address", metavar="FILE|URL", help="archive that `gausim pack` made: a path, or a URL of http or https")
-    add("--sha256", metavar="HASH", required=True, help="its hash, which the publisher tells")
-    add("--out", metavar="DIR", type=Path, help="new directory (default: outputs/fetched/NAME or data/NAME)")
+    add("--sha256", metavar="HASH", required=True, help="verify this hash, which the publisher states")
+    add("--out", metavar="DIR", type=Path, help="write this new directory (default: outputs/fetched/NAME or data/NAME)")
     return parser
 
 

@@ -42,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("pack")
     add = parser.add_argument
     add("source", metavar="RUN|DIR", type=Path, help="directory of a finished run, or of a data set")
-    add("--out", metavar="FILE.zip", type=Path, help="default NAME.zip")
-    add("--licence", metavar="ID", default="not stated", help="of the weights, for the run's card, e.g. CC-BY-4.0")
+    add("--out", metavar="FILE.zip", type=Path, help="write this archive (default: NAME.zip)")
+    add("--licence", metavar="ID", default="not stated", help="state this licence on the run's card, e.g. CC-BY-4.0")
     return parser
 
 

@@ -15,16 +15,16 @@ from gausim.core.errors import ConfigError
 
 # Modules of data_prep, with one line of help each.
 STAGES = {
-    "ingest": "films of several cameras to synchronised frames",
-    "poses": "camera poses of photos and fixed cameras, found by COLMAP or taken over",
-    "segment": "foreground masks: the object cut out of pictures or films",
-    "select": "marks the kernels that are simulated, pinned and compared",
-    "assemble": "stills, sequences and scene of one object to a data set",
-    "pack": "packs a data set's sequences for streaming",
-    "public": "brings a public set to our layout: READY, Spring-Gaus, PAC-NeRF, PhysTwin, PhysDreamer",
-    "corpus": "random elastic bodies with known motion and material, to pretrain on",
-    "synthesize": "the embedded synthetic set: puddings and flowers that MuJoCo moves",
-    "blender_bunny": "the paper's synthetic set: any mesh as a soft body of Blender",
+    "ingest": "synchronise the films of several cameras into frames",
+    "poses": "find the poses of photos and fixed cameras by COLMAP, or take them over",
+    "segment": "cut the object out of pictures or films",
+    "select": "mark the kernels that are simulated, pinned and compared",
+    "assemble": "assemble stills, sequences and scene of one object into a data set",
+    "pack": "pack a data set's sequences for streaming",
+    "public": "bring a public set to our layout: READY, Spring-Gaus, PAC-NeRF, PhysTwin, PhysDreamer",
+    "corpus": "make random elastic bodies with known motion and material, to pretrain on",
+    "synthesize": "make the embedded synthetic set: puddings and flowers that MuJoCo moves",
+    "blender_bunny": "make the paper's synthetic set: any mesh as a soft body of Blender",
 }
 
 

@@ -43,8 +43,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser("reconstruct")
     add = parser.add_argument
     add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
-    add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
-    add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
+    add("--transforms", metavar="FILE", help="take the stills of this transforms.json, where there is no data set")
+    add("--out", metavar="SCENE.ply", help="write this scene (default: ROOT/scene.ply)")
     add_fit_options(parser)
     add_pin_option(parser)
     return parser
@@ -93,31 +93,47 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options of the reconstruction."""
     add = parser.add_argument
     add("--extent", default="object", choices=("object", "scene"),
-        help="object: the foreground of the stills' alpha; scene: whole stills (default %(default)s)")  # fmt: skip
-    add("--kernels", type=int, metavar="N", help="intended number of Gaussians (default 2000, of a scene 30000)")
-    add("--iterations", type=int, default=4000, help="optimiser steps, one image each (default %(default)s)")
+        help="fit the object (the stills' alpha) or the scene (whole stills) (default %(default)s)")  # fmt: skip
+    add("--kernels", type=int, metavar="N", help="aim at N Gaussians (default 2000, of a scene 30000)")
+    add(
+        "--iterations",
+        type=int,
+        default=4000,
+        help="make so many optimiser steps, one image each (default %(default)s)",
+    )
     add("--patience", type=int, default=3, metavar="N", help="stop early after N checks without a lower mean loss, "
         "one per twentieth of the steps; 0 never (default %(default)s)")  # fmt: skip
-    add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="spherical harmonics (default %(default)s)")
-    add("--anisotropy", type=float, metavar="R", help="length over width of a kernel without penalty (default 3, "
+    add(
+        "--sh-degree",
+        type=int,
+        default=1,
+        choices=(0, 1, 2, 3),
+        help="fit spherical harmonics of this degree (default %(default)s)",
+    )
+    add("--anisotropy", type=float, metavar="R", help="penalise a length over width of a kernel above R (default 3, "
         "of a scene 10)")  # fmt: skip
     add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
         "of the masks' visual hull; of a scene the default is points.npz beside --transforms")  # fmt: skip
-    add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="fraction of the stills whose masks "
-        "may lack a part that all others show (default %(default)s)")  # fmt: skip
+    add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="let this fraction of the stills "
+        "have masks that lack a part that all others show (default %(default)s)")  # fmt: skip
     add("--video-share", type=float, default=0.5, metavar="FRACTION",
-        help="of ROOT: fraction of the steps at the size of the videos, on reduced stills and on frame 0 of the "
-        "training views; 0 uses the stills only (default %(default)s)")  # fmt: skip
-    add("--longest", type=int, metavar="PIXELS", help="of --transforms: reduce the stills to this length of their "
+        help="with ROOT: make this fraction of the steps at the size of the videos, on reduced stills and on frame 0 "
+        "of the training views; 0 uses the stills only (default %(default)s)")  # fmt: skip
+    add("--longest", type=int, metavar="PIXELS", help="with --transforms: reduce the stills to this length of their "
         "longer side")  # fmt: skip
-    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="of --transforms: fraction of the steps, "
-        "at the beginning, on stills of half the size (default %(default)s)")  # fmt: skip
-    add("--leave-out", type=int, default=10, metavar="N", help="of --transforms: one still in N is held out for "
+    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="with --transforms: make this fraction of "
+        "the steps, at the beginning, on stills of half the size (default %(default)s)")  # fmt: skip
+    add("--leave-out", type=int, default=10, metavar="N", help="with --transforms: leave one still in N out for "
         "evaluation (default %(default)s)")  # fmt: skip
-    add("--background", default="random", choices=("random", "black"), help="behind training images (random)")
-    add("--renderer", default="cpu", choices=("cpu", "reference"), help="default %(default)s")
+    add(
+        "--background",
+        default="random",
+        choices=("random", "black"),
+        help="draw this behind training images (default random)",
+    )
+    add("--renderer", default="cpu", choices=("cpu", "reference"), help="draw with this renderer (default %(default)s)")
     add_threads_option(parser)
-    add("--seed", type=int, default=0, help="seed of random numbers (default %(default)s)")
+    add("--seed", type=int, default=0, help="draw random numbers with this seed (default %(default)s)")
 
 
 def _options(arguments: argparse.Namespace) -> ReconstructionOptions:

@@ -93,11 +93,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("dirs", metavar="DIR", type=Path, nargs="*", help="run directories, sweeps, or any folder of them")
-    add("--out", metavar="DIR", type=Path, help="folder to write; default report in the first DIR")
-    add("--title", default="GausSim report", help="heading (default: %(default)s)")
+    add("--out", metavar="DIR", type=Path, help="write this folder (default: report in the first DIR)")
+    add("--title", default="GausSim report", help="print this heading (default: %(default)s)")
     add("--results", metavar="OUT", type=Path, help="write only results.md and tables.tex, to this folder: all "
         "figures with commit, command, hardware and cost")  # fmt: skip
-    add("--record", metavar="FILE.json", type=Path, help="instead write these figures as a small record for pages")
+    add("--record", metavar="FILE.json", type=Path, help="write only these figures, as a small record for pages")
     add("--page", metavar="FILE.md", type=Path, help="make FILE.md from FILE/page.md and the records FILE/*.json")
     add("--verbose", action="store_true", help="list the files that are written")
     add("--no-pictures", action="store_true", help="leave figures and videos out (a small page, in a second)")

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 USAGE = """usage: gausim train [KEY=VALUE ...] [-m] [--cfg job] [--info] [--resolve]
 
-Learns an object's dynamics from multi-view videos. Every setting is a key of conf/train.yaml and its groups:
+Learn an object's dynamics from multi-view videos. Every setting is a key of conf/train.yaml and its groups:
 
   gausim train                                  the embedded synthetic set, the default model
   gausim train data=DIRECTORY                   an object of your own

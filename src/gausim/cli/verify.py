@@ -30,6 +30,6 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("verify", " Exits with 1 if there are some.")
     parser.add_argument("root", metavar="ROOT", nargs="+", type=Path, help="object directories, or folders of them")
-    parser.add_argument("--quick", action="store_true", help="headers and sizes only: no image is read or hashed")
+    parser.add_argument("--quick", action="store_true", help="check headers and sizes only, without reading an image")
     parser.add_argument("--json", action="store_true", help="print an object: {DIRECTORY: [[file, fault], ...]}")
     return parser

@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sessions", metavar="DIR", type=Path, help="save sessions there (default: RUN/sessions or ./sessions)")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="listen at this address (default: 127.0.0.1)")
     add("--port", type=int, default=8080, help="listen at this port, 0: at a free one (default: 8080)")
-    add("--allow-remote", action="store_true", help="with --host: let other machines in, with the printed token")
+    add("--allow-remote", action="store_true", help="let other machines in by the printed token, with --host")
     add("--name", action="append", default=[], metavar="HOST", help="answer to this host name, too")
     add("--seconds", type=int, metavar="N", help="stop after so many seconds (default: when interrupted)")
     add_device_options(parser)
