@@ -41,7 +41,7 @@ SCENE = "scene.ply"
 class AssembleOptions(Options):
     """Facts beyond the pictures; None takes the value of a ``dataset.json`` beside them, or the default."""
 
-    name: str | None = option(None, "of the object (the result's folder)")
+    name: str | None = option(None, "name the object (default: as the result's folder)")
     fps: float | None = option(
         None, "state the frames per second (default: as transforms.json of the sequences)", least=1e-3, most=1e4
     )

@@ -57,7 +57,9 @@ def test_commands_and_options_of_the_pages_exist() -> None:
 
 
 def test_modules_and_functions_named_in_the_pages_exist() -> None:
-    named = {name for page in PAGES for name in re.findall(r"`(gausim(?:\.\w+)+)(?:\(|`)", page.read_text())}
+    named = {
+        name for page in PAGES for name in re.findall(r"(?:`|::: )(gausim(?:\.\w+)+)(?:\(|`|\n)", page.read_text())
+    }
     assert len(named) > 5
     for name in named:
         assert pkgutil.resolve_name(name) is not None
@@ -118,9 +120,9 @@ def test_scripts_of_the_tables_name_commands_options_and_keys_that_exist(script:
 # What stands for something in the pages, and options that make every command small.
 RUN = "outputs/mine/seed_0"
 STANDS_FOR = {
-    "MINE": "data/pudding_soft", "MINE/scene.ply": "data/pudding_soft/scene.ply", "NEW": "data/pudding_soft", "RUN": RUN,
-    "RUN2": RUN, "SCENE.ply": "data/pudding_soft/scene.ply", "data=MINE": "data=data/pudding_soft", "seed=0,1,2": "seed=0",
-    "push.json": f"{RUN}/simulation/pudding_soft/forces/session.json", "--format FORMAT": "--format ply",
+    "MINE": "data/pudding_soft", "MINE/scene.ply": "data/pudding_soft/scene.ply", "NEW": "data/pudding_soft",
+    "RUN": RUN, "RUN2": RUN, "SCENE.ply": "data/pudding_soft/scene.ply", "data=MINE": "data=data/pudding_soft",
+    "seed=0,1,2": "seed=0", "push.json": f"{RUN}/simulation/pudding_soft/forces/session.json",
     "outputs/demo/seed_0": RUN, "outputs/pretrain/seed_0": RUN, "DIR…": RUN,
 }  # fmt: skip
 SMALL = {

@@ -132,7 +132,7 @@ def test_options_begin_with_a_verb() -> None:
     wrong = {}
     for name, text in _help():
         options = text.partition("options:")[2]
-        found = re.findall(rf"(?m)^  (--[\w-]+(?: [^\n]*?)?)(?:  +|\n {{8,}}){described}", options)
+        found = re.findall(rf"(?m)^  (--[\w-]+(?: \S+)*?)(?:  +|\n {{8,}}){described}", options)
         if found:
             wrong[name] = found
     assert not wrong

@@ -24,10 +24,10 @@ GRAVITY = 9.8
 class ImportOptions(Options):
     """Options of every reader."""
 
-    name: str | None = option(None, "of the object (the folder's)")
-    fps: float | None = option(None, "frames per second (what the set says)", least=1e-3, most=1e4)
-    train_frames: int | None = option(None, "first frames to train on (the set's own split)", least=2, metavar="N")
-    heldout: tuple[str, ...] = option((), "cameras never to train on (none)", type=names, metavar="CAM,CAM")
+    name: str | None = option(None, "name the object (default: as the folder)")
+    fps: float | None = option(None, "state the frames per second (what the set says)", least=1e-3, most=1e4)
+    train_frames: int | None = option(None, "train on so many first frames (the set's own split)", least=2, metavar="N")
+    heldout: tuple[str, ...] = option((), "never train on these cameras (none)", type=names, metavar="CAM,CAM")
     longest: int | None = option(
         None, "reduce pictures whose longer side is longer (keep them)", least=16, metavar="PIXELS"
     )

@@ -149,7 +149,7 @@ def test_several_objects_have_a_summary(sweep: Path) -> None:
     names = ("toy_bunny", "toy_cube")
     assert [c.label for c in grid.columns] == [f"{n}: {w}" for n in names for w in ("l2 [1e-3]", "3D ÷ static")]
     full = next(row for row in shown(grid).values() if all(row))
-    assert [text.rstrip("*") for text in full[::2]] == ["11.00", "20.00"]
+    assert [text.rstrip("*") for text in full[::2]] == ["11.0", "20.0"]
 
 
 def test_the_papers_own_figures() -> None:

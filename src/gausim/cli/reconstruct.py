@@ -117,13 +117,13 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="let this fraction of the stills "
         "have masks that lack a part that all others show (default %(default)s)")  # fmt: skip
     add("--video-share", type=float, default=0.5, metavar="FRACTION",
-        help="with ROOT: make this fraction of the steps at the size of the videos, on reduced stills and on frame 0 "
-        "of the training views; 0 uses the stills only (default %(default)s)")  # fmt: skip
-    add("--longest", type=int, metavar="PIXELS", help="with --transforms: reduce the stills to this length of their "
-        "longer side")  # fmt: skip
-    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="with --transforms: make this fraction of "
-        "the steps, at the beginning, on stills of half the size (default %(default)s)")  # fmt: skip
-    add("--leave-out", type=int, default=10, metavar="N", help="with --transforms: leave one still in N out for "
+        help="make this fraction of the steps at the size of the videos, on reduced stills and on frame 0 "
+        "of the training views; 0 uses the stills only (with ROOT; default %(default)s)")  # fmt: skip
+    add("--longest", type=int, metavar="PIXELS", help="reduce the stills of --transforms to this length of "
+        "their longer side")  # fmt: skip
+    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="make this fraction of the steps, at the "
+        "beginning, on stills of --transforms at half the size (default %(default)s)")  # fmt: skip
+    add("--leave-out", type=int, default=10, metavar="N", help="leave one still of --transforms in N out for "
         "evaluation (default %(default)s)")  # fmt: skip
     add(
         "--background",

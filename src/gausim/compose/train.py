@@ -266,6 +266,6 @@ def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
         return []
     return [
         f"warning: in {shows} uses of a sequence at optimizer.initial_lr={rate:g} an initial state moves by "
-        f"{reach:.2g} of the diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
-        f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or plan.epochs."
+        f"{reach:.2g} of the diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first "
+        f"frame. Raise optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or plan.epochs."
     ]

@@ -49,8 +49,9 @@ def add_force_options(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f"--{kind}", nargs="+", action="append", default=[], metavar="KEY=VALUE", help=text)
     group.add_argument("--session", metavar="FILE", help="replay a session that was recorded (gausim view, --force)")
     group.add_argument("--metre", type=float, default=1.0, metavar="UNITS",
-                       help="scene units per metre, which scale the unit of weight (default: 1)")  # fmt: skip
-    group.add_argument("--most-force", type=float, metavar="WEIGHTS", help="the largest force (default: 10)")
+                       help="scale the unit of weight by so many scene units per metre (default: 1)")  # fmt: skip
+    group.add_argument("--most-force", type=float, metavar="WEIGHTS",
+                       help="limit forces to so many weights (default: 10)")  # fmt: skip
 
 
 def has_forces(arguments: argparse.Namespace) -> bool:
