@@ -1,7 +1,5 @@
 """`gausim.load`: the ten lines of the documentation, run as they stand there."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

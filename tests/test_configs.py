@@ -1,7 +1,5 @@
 """Every file in conf/ composes, names only what may be built, fits the signatures it names, and builds where it can."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

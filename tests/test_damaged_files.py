@@ -1,7 +1,5 @@
 """Damaged and hostile files: every reader refuses them by a message that names the file, and runs nothing in them."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,14 +1,14 @@
-"""The documentation names pages, commands and options that exist."""
-
-from __future__ import annotations
+"""Pages name pages, commands and options that exist; notebooks are stripped; dependencies are pinned."""
 
 import contextlib
 import io
+import json
 import os
 import pkgutil
 import re
 import shlex
 import subprocess
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +18,47 @@ from gausim.cli.main import COMMANDS
 from gausim.cli.main import command as command_of
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_dependencies_are_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    groups = [project["dependencies"], *project["optional-dependencies"].values()]
+    declared = {normal(re.split(r"[^\w.-]", line)[0]) for group in groups for line in group}
+    pinned = {normal(line.split("==")[0]) for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert len(declared) > 30 and declared <= pinned, declared - pinned
+
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def cells(path: Path, kind: str) -> list[dict]:
+    return [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == kind]
+
+
+def text(path: Path) -> str:
+    return "\n".join("".join(cell["source"]) for kind in ("markdown", "code") for cell in cells(path, kind))
+
+
+def test_the_four_are_there() -> None:
+    assert [path.stem for path in NOTEBOOKS] == ["01_quickstart", "02_physics", "03_ablation_report", "04_forces"]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_outputs_are_stripped_any_environment_has_the_kernel_and_named_files_exist(path: Path) -> None:
+    for cell in cells(path, "code"):
+        assert cell["outputs"] == [] and cell["execution_count"] is None, f"{path.name}: run nbstripout"
+        assert "execution" not in cell["metadata"]
+    assert json.loads(path.read_text())["metadata"]["kernelspec"]["name"] == "python3"
+    named = re.findall(r"`((?:docs|notebooks|conf)/[\w./-]+|README\.md)`", text(path))
+    assert named, f"{path.name} points nowhere"
+    for name in named:
+        assert (ROOT / name).exists(), f"{path.name} names {name}, which is not there"
+
+
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SCRIPTS = sorted((ROOT / "docs" / "results" / "commands").glob("*.sh"))
 NAMES_PAGES = ("src", "conf", "data_prep", "Makefile", "CHANGELOG.md", "CONTRIBUTING.md", "docker")

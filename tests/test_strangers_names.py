@@ -1,7 +1,5 @@
 """Names, paths, numbers and YAML of strangers: obeyed, or refused in a sentence before anything is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

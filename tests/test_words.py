@@ -1,7 +1,5 @@
 """Words: pages, help texts and messages use the field's terms, leading zeros and short sentences."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import importlib

@@ -1,12 +1,10 @@
 """The deformation field: rest at first, covariances as its scales and quaternions say, looping, a scene it learns."""
 
-from __future__ import annotations
-
 import torch
 from helpers.fitted_methods import recorded, rolled
 
 from gausim.baselines.deformation_field import DeformationField
-from gausim.core import FittedMethod, SimState
+from gausim.core import SimState
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.rotation import quaternion_to_matrix
@@ -16,17 +14,6 @@ def made(seen: int = 4, **sizes: int) -> DeformationField:
     torch.manual_seed(0)
     sizes = {"resolution": 6, "features": 8, "hidden": 16, **sizes}
     return DeformationField(**recorded(seen=seen), **sizes)
-
-
-def test_it_begins_at_rest_and_satisfies_the_contract() -> None:
-    field = made()
-    assert isinstance(field, FittedMethod)
-    with torch.no_grad():
-        state = field.advance(field.begin(0))
-    torch.testing.assert_close(state.positions, field.scenes[0].means)
-    torch.testing.assert_close(
-        state.deformation_gradients, torch.eye(3).expand_as(state.deformation_gradients), atol=1e-6, rtol=0
-    )
 
 
 def test_gradients_reproduce_the_deformed_covariance() -> None:

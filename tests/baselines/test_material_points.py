@@ -1,7 +1,5 @@
 """PhysDreamer and PhysGaussian: kernels and their particles, a known material found again, units, messages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -15,7 +13,7 @@ from torch import Tensor
 
 pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
-from gausim.baselines.material_point.driven import clustered, opaque
+from gausim.baselines.material_point.driven import clustered
 from gausim.baselines.material_point.method import Discretisation, MaterialPoints
 from gausim.baselines.material_point.physdreamer import ModulusField, PhysDreamer
 from gausim.baselines.material_point.physgaussian import PhysGaussian
@@ -27,7 +25,6 @@ from gausim.core import (
     FittedState,
     Floor,
     GaussianScene,
-    SceneError,
     SimState,
     Surroundings,
     TakesOver,
@@ -78,27 +75,6 @@ def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
     torch.testing.assert_close(deformation_gradients, wanted.expand(36, 3, 3), rtol=0, atol=1e-6)
     u, _, vt = torch.linalg.svd(wanted)
     torch.testing.assert_close(rotations, (u @ vt).expand(36, 3, 3), rtol=0, atol=1e-5)
-
-
-def test_clusters_and_pins() -> None:
-    scene = toy_scene()
-    driven = clustered(scene, 20)
-    assert len(driven.rest) == 20 and int(driven.pinned.sum()) == 5  # a quarter of the kernels is pinned
-    assert float(driven.rest[driven.pinned, 2].max()) < 0.01 < 0.3 < float(driven.rest[~driven.pinned, 2].min())
-    with pytest.raises(SceneError, match=r"toy: expected at least 8 simulated kernels"):
-        clustered(replace(scene, simulated=torch.arange(36) < 5, pinned=torch.arange(36) < 1), 20)
-
-
-def test_transparent_kernels_follow_the_nearest_particle() -> None:
-    scene = toy_scene()
-    logits = scene.opacity_logits.clone()
-    logits[[35, 20]] = -6.0
-    driven = opaque(replace(scene, opacity_logits=logits), 0.02)
-    assert len(driven.rest) == 34 and driven.followed.shape == (36, 1)
-    near = torch.cdist(scene.means[[35]], driven.rest).argmin()
-    assert int(driven.followed[35, 0]) == int(near)
-    with pytest.raises(SceneError, match=r"opacity above 0.99999.*model\.method\.opacity"):
-        opaque(scene, 0.99999)
 
 
 def test_filled_interiors_are_particles_and_pinned_near_pins() -> None:
@@ -214,19 +190,6 @@ def test_sequences_share_the_modulus_and_nothing_else() -> None:
     assert sorted(method.penalties(1)) == ["modulus_variation", "velocity_variation"]
 
 
-def test_moduli_keep_to_what_the_substeps_allow() -> None:
-    method = dreamer(most_substeps=20)
-    bias = method.modulus_field[0].network[-1].bias  # type: ignore[index,union-attr]
-    with torch.no_grad():
-        bias.fill_(0.5)  # type: ignore[operator,union-attr]
-        assert float(method.modulus(0)[0]) == pytest.approx(TRUE * math.exp(0.5), rel=1e-5)
-        bias.fill_(50.0)  # type: ignore[operator,union-attr]
-        assert method.substeps(0) == 20
-        method.advance(swaying(method))
-        bias.fill_(-50.0)  # type: ignore[operator,union-attr]
-        assert float(method.modulus(0)[0]) == 1e3
-
-
 def test_a_modulus_means_the_same_in_both_methods() -> None:
     source, method = dreamer(), gaussian()
     with torch.no_grad():
@@ -244,27 +207,6 @@ def test_a_modulus_means_the_same_in_both_methods() -> None:
     torch.testing.assert_close(moves[1][order], moves[0], rtol=1e-4, atol=1e-5)
     with pytest.raises(ConfigError, match=r"same scenes and sequences"):
         method.take_over(dreamer(velocity_resolution=10))
-
-
-@pytest.mark.parametrize(
-    ("make", "options", "message"),
-    [
-        (dreamer, {"young_modulus": 10.0}, r"model\.method\.material\.young_modulus: expected 1000 \.\. 5e\+08"),
-        (gaussian, {"young_modulus": math.inf}, r"young_modulus: expected"),
-        (
-            dreamer,
-            {"young_modulus": 1e8, "most_substeps": 100},
-            r"young_modulus: 1e\+08 would need more than 100 substeps",
-        ),
-        (dreamer, {"scale": 0.0}, r"model\.method\.modulus: expected resolution >= 2 and scale > 0"),
-        (dreamer, {"particles": 3}, r"model\.method: expected particles >= 8"),
-        (dreamer, {"velocity_scale": 0.0}, r"velocity_scale > 0"),
-        (gaussian, {"poisson_ratio": 0.5}, r"poisson_ratio: expected -1 < nu < 0.5"),
-    ],
-)
-def test_wrong_settings_name_their_field(make: Callable[..., Any], options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        make(**options)
 
 
 def falling_scene() -> GaussianScene:
@@ -299,13 +241,3 @@ def test_loss_gradients_reach_the_place_where_a_free_body_begins() -> None:
     assert method.shift.grad[1, 0] == pytest.approx(longest, rel=1e-3)
     assert method.shift.grad[0].abs().max() == 0
     assert any(p is method.shift for p in method.parameter_groups()["velocity"])
-
-
-def test_bodies_in_hands_are_refused() -> None:
-    scene = toy_scene()
-    held = replace(scene, hand=torch.where(scene.pinned, 0, -1))
-    with pytest.raises(ConfigError, match=r"'toy' has a 'grip' of hands in its dataset.json.*model=gausim"):
-        gaussian(held)
-    trained = replace(scene, surroundings=Surroundings(trains_gravity=True))
-    with pytest.raises(ConfigError, match=r"'toy' has 'gravity' that is trained"):
-        gaussian(trained)

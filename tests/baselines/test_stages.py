@@ -1,7 +1,5 @@
 """Stages as data: which one, how many frames and what rate at any time; what a plan refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

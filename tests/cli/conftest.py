@@ -1,7 +1,5 @@
 """Fixtures of the commands' tests: a second toy object, a joint run, and evaluations in this process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

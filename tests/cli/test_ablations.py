@@ -1,7 +1,5 @@
 """Every file of conf/ablation switches off what it says, in both models, and what is left can be trained."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,6 @@
-"""Where commands compute: the choice of a device, and what is drawn there."""
+"""Options are spelled alike, and devices."""
 
-from __future__ import annotations
-
+import re
 from pathlib import Path
 
 import pytest
@@ -11,11 +10,48 @@ from helpers.random_scene import random_scene
 import gausim
 from gausim.cli import evaluate
 from gausim.cli import main as cli
+from gausim.cli.prepare import STAGES
 from gausim.compose import device as home
 from gausim.compose.device import find_device
 from gausim.core import ConfigError, Rendered, Trajectory
 from gausim.ops.orbit import orbit_cameras
 from gausim.render.draw import draw_still, film
+
+HYDRA = ("train", "config")
+COMMANDS = [[name] for name in cli.COMMANDS if name not in ("prepare", *HYDRA)]
+EVERY = [*COMMANDS, *(["prepare", stage] for stage in STAGES)]
+# Other words for the same: --objects, --sequences and --cameras of names, --overwrite, --pin, --device, --threads.
+WRONG = {
+    *("object", "sequence", "camera", "view", "replace", "clobber", "pin-below", "pin-above", "pins", "cuda", "gpu"),
+    *("accelerator", "num-threads", "nthreads", "jobs"),
+}
+PRESENT = {
+    "objects": ("evaluate", "simulate", "view", "export", "inspect"), "sequences": ("evaluate", "simulate", "adapt"),
+    "cameras": ("evaluate", "simulate", "export"), "device": ("evaluate", "simulate", "view", "export"),
+    "threads": ("evaluate", "simulate", "view", "export", "doctor", "reconstruct"), "overwrite": ("adapt",),
+    "pin": ("inspect", "reconstruct", "doctor", "simulate", "view"),
+}  # fmt: skip
+
+
+def shown(argv: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit) as ended:
+        cli.command(argv[0])([*argv[1:], "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("argv", EVERY, ids=" ".join)
+def test_each_meaning_has_its_spelling(argv: list[str], capsys, monkeypatch) -> None:
+    text = shown(argv, capsys, monkeypatch)
+    parts = re.split(r"^\s+(?:-\w, )?--(?=[a-z])", text, flags=re.MULTILINE)[1:]
+    options = {re.match(r"[a-z-]+", part)[0]: part for part in parts}
+    assert not WRONG & set(options), WRONG & set(options)
+    assert "force" not in options or "KEY=VALUE" in options["force"]
+    for name, commands in PRESENT.items():
+        assert name in options or argv[0] not in commands, name
+    for name in ("device", "threads"):
+        assert argv[0] == "prepare" or name not in options or "default: " in options[name]
 
 
 @pytest.mark.parametrize(("gpus", "text", "found"), [
@@ -38,12 +74,6 @@ def test_a_gpu_that_is_not_there_is_one_sentence(monkeypatch, capsys) -> None:
         assert len(told) == 1 and "--device cuda: PyTorch sees 0 CUDA devices" in told[0], argv
     with pytest.raises(ConfigError, match="--device cuda"):
         gausim.load("RUN", device="cuda")
-
-
-@pytest.mark.parametrize("command", ["simulate", "view"])
-def test_the_options_of_a_scene_are_refused_with_a_run(command: str, tmp_path: Path, capsys) -> None:
-    assert cli.main([command, str(tmp_path), "--pin", "below z=0.1", "--device", "cpu"]) == 2
-    assert "expected with" in capsys.readouterr().err
 
 
 def test_all_that_a_renderer_gets_is_on_the_device_of_the_motion() -> None:

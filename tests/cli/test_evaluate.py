@@ -1,9 +1,6 @@
 """`gausim evaluate` and `gausim simulate` of a run that knows the true motion."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +11,7 @@ from helpers.played import stand_in
 
 from gausim.cli import evaluate, evaluate_run, simulate, simulate_run
 from gausim.compose import build
-from gausim.core import ConfigError, DataError, GausSimError, SimState
+from gausim.core import SimState
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
 
@@ -106,20 +103,3 @@ def test_more_frames_than_were_recorded_of_all_sequences(run):
     frames = list(read_video(folder / "cam_1.mp4"))
     assert len(frames) == 26 and load_trajectory(folder / "trajectory.safetensors").frames == 26
     assert frames[5][40, 20].min() > 240 > 40 > frames[25][40, 20].max()  # beyond the recording there is no truth
-
-
-@pytest.mark.parametrize(
-    ("command", "asked", "error", "message"),
-    [
-        (evaluate.main, ["--objects", "cat"], DataError, r"no object \['cat'\]; it has \['toy'\]"),
-        (evaluate.main, ["--sequences", "seq_7"], DataError, "no sequence .*seq_7"),
-        (simulate.main, ["--sequences", "seq_9"], DataError, "seq_9"),
-        (simulate.main, ["--cameras", "cam_9"], DataError, "cam_9"),
-        (simulate.main, ["--background", "mauve"], ConfigError, "--background mauve"),
-    ],
-)
-def test_what_is_not_there_is_named(
-    run, command: Callable[[list[str]], int], asked: list[str], error: type[GausSimError], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        command([str(run.run_dir), *asked])

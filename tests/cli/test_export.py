@@ -1,7 +1,5 @@
 """Every format of `gausim export`, from a run and back from its files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +10,7 @@ from helpers.glb_files import GlbFile
 from PIL import Image
 
 from gausim.cli import export
-from gausim.core import ConfigError, DataError
+from gausim.core import ConfigError
 from gausim.io.ply import save_scene
 from gausim.io.ply_sequence import load_ply_sequence
 from gausim.io.trajectory import load_trajectory
@@ -103,28 +101,3 @@ def test_frames_as_gltf(run) -> None:
     assert sorted(path.name for path in Path("g").iterdir()) == [f"toy_seq_000_000{i}.glb" for i in (1, 2)]
     found = GlbFile(Path("g/toy_seq_000_0002.glb")).attribute("POSITION")
     assert torch.equal(found, run.module.predict(0, 3).positions[2])
-
-
-@pytest.mark.parametrize(
-    ("argv", "error", "message"),
-    [
-        (["RUN", "--format", "gif", "--cameras", "cam_9"], DataError, "--cameras cam_9: expected one of .'cam_0'"),
-        (["RUN", "--format", "ply", "--sequences", "x"], DataError, "has no sequence 'x'"),
-        (["RUN", "--format", "ply", "--objects", "x"], DataError, "has no object"),
-        (["RUN", "--format", "usd", "--out", "m.txt"], ConfigError, "ends in .usd"),
-        (["t.safetensors", "--format", "ply"], ConfigError, "name its rest scene with --scene"),
-        (["t.safetensors", "--format", "ply", "--scene", "s.ply"], DataError, "t.safetensors: no such file"),
-        (["t.safetensors", "--format", "gif", "--scene", "nine.ply"], DataError, "has 36 kernels, but nine.ply has 9"),
-    ],
-)
-def test_what_cannot_be_exported(run, argv: list[str], error: type[Exception], message: str) -> None:
-    if "usd" in " ".join(argv):
-        pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
-    if "nine.ply" in argv:
-        stored = ["--format", "safetensors", "--frames", "2", "--out", "t.safetensors"]
-        assert export.main([str(run.run_dir), *stored]) == 0
-        scene = run.module.model.scenes[0]
-        save_scene(scene.select(torch.arange(scene.count) < 9), "nine.ply")
-    argv = [str(run.run_dir) if word == "RUN" else word for word in argv]
-    with pytest.raises(error, match=message):
-        export.main(argv)

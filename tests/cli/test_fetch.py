@@ -1,7 +1,5 @@
 """`gausim pack` and `gausim fetch`: from a trained run to a run that works elsewhere; where data lie."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading
@@ -18,7 +16,7 @@ from gausim.cli import fetch, pack, simulate
 from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.compose.data_paths import data_option, located, outside_files
-from gausim.core import ConfigError, DataError, FetchError, RunError
+from gausim.core import DataError, FetchError, RunError
 from gausim.io.files import sha256
 
 
@@ -115,15 +113,6 @@ def test_a_fetched_run_names_what_it_misses_and_works_with_it(
         simulate.main([str(run)])
     assert simulate.main([str(run), "--data", "toy_moved", "--frames", "3", "--cameras", "cam_0"]) == 0
     assert load_run(run, data={"root": "toy_moved"}).objects[0].scene_path == run / "scenes" / "scene.ply"
-
-
-def test_words_become_keys_of_the_data_configuration():
-    assert data_option([]) == {}
-    assert data_option(["a"]) == {"root": "a"}
-    assert data_option(["a", "root=b=c", "scene=s.ply"]) == {"root": ["a", "b=c"], "scene": "s.ply"}
-    assert data_option(["odd=name"]) == {"root": "odd=name"}
-    with pytest.raises(ConfigError, match="--data masks=b: masks is given twice"):
-        data_option(["masks=a", "masks=b"])
 
 
 def test_entries_keep_what_else_they_say(tmp_path: Path):

@@ -1,7 +1,5 @@
 """Fitted methods through the same commands as the simulator: train, evaluate, report, simulate; resume; messages."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -141,18 +139,6 @@ def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
     assert any("is of 40 iterations per sequence; the original takes 100" in note for note in notes)
     assert len(cut) == 2 and all("0 of its" not in note for note in cut)
     assert json.loads(Path("outputs/toy/seed_0/FINISHED").read_text())["notes"] == notes
-
-
-def test_what_a_stage_asks_for_must_be_there(arguments: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"stages\.dynamics\.rates: \['softness'\].*attenuation.*stiffness"):
-        train.main(["model=spring_mass", f"+{STAGES}.dynamics.rates.softness=1", *arguments])
-    with pytest.raises(ConfigError, match=r"init_from, freeze: spring_mass is fitted"):
-        train.main(["model=spring_mass", "init_from=somewhere", *arguments])
-    with pytest.raises(ConfigError, match=r"model\.method\.anchors: expected at least 4"):
-        train.main(["model=spring_mass", "model.method.anchors=2", *arguments])
-    train.main(["model=static", *arguments])
-    with pytest.raises(ConfigError, match="--endurance: static takes no forces"):
-        evaluate.main(["outputs/toy/seed_0", "--endurance", "300"])
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """`gausim inspect`: figures, picture, masks, and the way out where nothing is pinned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -47,36 +45,6 @@ def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixtu
     assert image is not None and image.shape[0] > 500
     assert (image.max(-1) > image.min(-1)).any()  # units in colours, not grey only
     assert torch.equal(load_scene(scene_file).pinned, load_scene(scene_file).means[:, 2] < 0.1)
-
-
-@pytest.mark.parametrize(("more", "down"), [([], True), (["--up=-z"], True), (["--up=z"], False)])
-def test_up_points_away_from_the_pins_unless_given(scene_file: Path, monkeypatch, more: list[str], down: bool) -> None:
-    drawn: list[bool] = []
-    monkeypatch.setattr(kernels, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
-    assert main(["inspect", str(scene_file), "--pin", "above z=1.9", *more]) == 0
-    assert drawn == [down]
-
-
-def test_simulated_half(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--simulate", "below x=0.5", "--pin", "below z=0.1", "--radii", "0.5"]
-    assert "simulated 30  pinned 6" in inspect(scene_file, capsys, *options)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "needle"),
-    [
-        ([], "no kernel is pinned"),
-        (["--pin", "below z=-5"], "holds none of 60 kernels"),
-        (["--pin", "below height=3"], "AXIS=VALUE"),
-        (["--pin", "below z=0.1", "--radii", "40"], "--radii"),
-        (["--masks", "absent.npz"], "absent.npz: no such file"),
-    ],
-)
-def test_wrong_options_are_explained(
-    scene_file: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], needle: str
-) -> None:
-    assert main(["inspect", str(scene_file), *arguments]) == 2
-    assert needle in capsys.readouterr().err
 
 
 def test_the_default_hierarchy_is_that_of_the_model() -> None:

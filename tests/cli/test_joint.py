@@ -1,7 +1,5 @@
 """Several objects of different stores with one network, and what a new object takes over from it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -12,7 +10,7 @@ from torch import Tensor
 from gausim.cli import evaluate
 from gausim.cli import train as command
 from gausim.compose.build import load_run
-from gausim.core import ConfigError, RunError
+from gausim.core import ConfigError
 from gausim.results.table import load_results
 from gausim.training.callbacks.resume import RunCheckpoint
 
@@ -107,18 +105,3 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path,
     assert not (tmp_path / "wide" / "seed_0" / "last.ckpt").exists()
     with pytest.raises(ConfigError, match=r"network\.processor\.1\.\w+\.\w+ is absent there, of shape"):
         tune(other, joint, tmp_path / "deep", "model.simulator.network.layers=2")
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        (["experiment=pretrain_fit", "data=object"], r"init_from: name the trained run.*init_from=RUN"),
-        (["freeze=network"], r"freeze: a network at random.*init_from=RUN"),
-        (["init_from=nowhere"], r"nowhere/last\.ckpt: no such checkpoint"),
-        (["data.names=[]"], r"data\.names: \[\] asked for, the roots hold \['toy', 'other'\]"),
-    ],
-)
-def test_what_is_missing_is_said(asked: list[str], message: str, toy: Path, other: Path, tmp_path: Path) -> None:
-    root = both(toy, other) if "data.names=[]" in asked else f"data.root={other}"
-    with pytest.raises((ConfigError, RunError), match=message):
-        command.main([*asked, root, f"hydra.run.dir={tmp_path}/seed_0", *TINY])

@@ -1,7 +1,5 @@
 """The test part of a data set: sealed in training, opened by a declared look, and said in every table."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,10 +1,7 @@
 """Forces and sessions: files are written, replays are the same, wrong words are named, a thousand steps stay sound."""
 
-from __future__ import annotations
-
 import json
 import random
-import re
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,7 @@ from helpers import toy_object
 from helpers.simulators import LEVELS
 from msgspec.structs import replace
 
-from gausim.cli import main, simulate, train
+from gausim.cli import simulate, train
 from gausim.compose.build import load_run
 from gausim.compose.live import ENERGY_ROOM, open_interaction
 from gausim.core import DataError
@@ -95,29 +92,6 @@ def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) ->
     save_session(replace(session, made_with=replace(session.made_with, scene_hash="0")), tmp_path / "other.json")
     with pytest.raises(DataError, match="other.json: it is of another scene"):
         simulate.main(replayed)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--force", "weights=3"], "--force weights=3: force: Missing required argument 'direction'"),
-        (["--force", "weights=1", "direction=x", "weight=2"], "'weight=2': expected KEY=VALUE"),
-        (["--force", "weights=1", "direction=x", "on=head"], "on=head: expected whole, tip"),
-        (["--force", "weights=1", "direction=x", "at=99"], "at=99: expected 0 to 19"),
-        (["--wind", "weights=1", "direction=x", "--metre", "0"], "--metre 0.0: expected more than 0"),
-        (["--wind", "weights=1", "direction=x", "--sequences", "seq_000", "seq_001"], "name one of --objects"),
-        (["--wind", "weights=1", "direction=x", "--session", "s.json"], "has its own forces"),
-        (["--session", "none.json"], "none.json: cannot be read .No such file"),
-    ],
-)
-def test_wrong_words_are_named(played, monkeypatch, capsys, options: list[str], message: str) -> None:
-    monkeypatch.delenv("GAUSIM_DEBUG", raising=False)
-    try:
-        assert main.main(["simulate", str(played.run_dir), *options]) == 2
-    except SystemExit as stop:
-        assert stop.code == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error) and "Traceback" not in error
 
 
 def test_parts_and_directions(played) -> None:

@@ -1,7 +1,5 @@
 """A sweep that dies, fails or meets another process goes on by its own command; each run is made once."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -13,9 +11,7 @@ import pytest
 from helpers.sweeps import Sweeps, dying, history, write_toy_object
 from hydra.core.hydra_config import HydraConfig
 
-from gausim.cli import train as command
 from gausim.compose import root as _conf
-from gausim.core import ConfigError
 from gausim.runs.checkpoint import digest, read_checkpoint
 from gausim.runs.files import sole_writer
 
@@ -75,23 +71,6 @@ def test_a_job_that_failed_later_is_tried_again_on_demand(do: Sweeps) -> None:
     assert status == 2 and "left out, failed before" in output, output
     status, output = do("later", "seed=0", "retry_failed=true")
     assert status == 0 and "1 trained" in output and steps(run) == 8, output
-
-
-@pytest.mark.parametrize(
-    ("swept", "message"),
-    [
-        ("experiment=glob(nothing_*)", "expected at least one value"),
-        ("ablation=none,nope", "nope"),
-        ("hydra/launcher=nope", r"pip install 'gausim\[sweep\]'"),
-    ],
-)
-def test_what_cannot_be_swept_is_told_before_anything_runs(
-    swept: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=message):
-        command.main(["-m", swept])
-    assert not list(tmp_path.rglob("seed_*"))
 
 
 def test_threads_are_shared_among_the_jobs_of_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Dashboards as `gausim train` uses them: names from the sweep, and no trace in what is learned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

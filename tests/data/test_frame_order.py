@@ -1,7 +1,5 @@
 """Order of the frames of a sequence's image files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

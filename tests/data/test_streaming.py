@@ -1,7 +1,5 @@
 """Training streams: a few batches in memory, each rank its share, every frame once."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small samples of public sets, written once; tests that damage them mend them again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

@@ -5,8 +5,6 @@ A program, not a test: it reads one JSON object per line (stage, argv, die) and 
 beside its result; what numba keeps in its cache on the way, once, is no such place.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Results of the stages become one object that is complete and right; from films and photos to training by one file."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """The set made by Blender: its layout, resumption, environment and processes, with stand-ins for Blender and pip."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -12,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +22,8 @@ from data_prep.blender import environment as blender_env
 from data_prep.blender import plan as planning
 from data_prep.blender.environment import BlenderError, BlenderProcess, find_blender
 from data_prep.blender.meshes import Surface, make_surface, read_mesh
-from data_prep.blender.plan import Pictures, Plan, Soft, action, camera
-from data_prep.blender_bunny import main, make_set
-from gausim.core import ConfigError
+from data_prep.blender.plan import Pictures, Plan, action, camera
+from data_prep.blender_bunny import make_set
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
 
@@ -130,25 +126,6 @@ def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: 
         make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(skip="cam_1/0003.png"), workers=3)
 
 
-@pytest.mark.parametrize(
-    ("make", "what"),
-    [
-        (lambda: replace(PLAN, sequences=0), "--sequences: expected 1 to 1000, got 0"),
-        (lambda: replace(PLAN, frames=1), "--frames"),
-        (lambda: replace(PLAN, heldout=3), "--heldout: expected fewer than the 3"),
-        (lambda: Pictures(resolution=(20, 1)), "--resolution"),
-        (lambda: Pictures(still_resolution=(99999, 20)), "--still-resolution"),
-        (lambda: replace(PLAN, amplitude=(9.0, 8.0)), "--amplitude: expected LOW <= HIGH"),
-        (lambda: replace(PLAN, amplitude=(9.0, float("nan"))), "--amplitude"),
-        (lambda: Soft(stiffness=1.5), "--stiffness"),
-        (lambda: replace(PLAN, up="w"), "--up"),
-    ],
-)
-def test_impossible_plans_are_refused(make: Callable[[], object], what: str) -> None:
-    with pytest.raises(ConfigError, match=what):
-        make()
-
-
 def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:
     actions = [action(PLAN, surface, i) for i in range(10)]
     assert actions == [action(PLAN, surface, i) for i in range(10)]
@@ -228,16 +205,6 @@ def test_a_process_is_stopped_when_another_failed(tmp_path: Path) -> None:
         BlenderProcess(program(tmp_path / "python", code)).run({}, told, stop)
     with pytest.raises(ProcessLookupError):
         os.kill(int(heard[0]), 0)
-
-
-def test_command_line(tmp_path: Path, mesh: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["--mesh", str(mesh), "--out", str(tmp_path / "set"), "--blender-python", str(tmp_path / "absent")]
-    assert main([*given, "--quick"]) == 2
-    assert "error: --blender-python" in capsys.readouterr().err
-    assert main([*given, "--quick", "--frames", "1"]) == 2
-    assert "error: --frames: expected 2" in capsys.readouterr().err
-    mesh.write_text("v 0 0 nan\n")
-    assert main(given) == 2
 
 
 # ----------------------------------------------------------------------------------------------------------- the real

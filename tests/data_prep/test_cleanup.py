@@ -1,7 +1,5 @@
 """Cleaning of masks: holes, parts, flashes and edges."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup, cleaned, fill_holes, keep_largest, soften, steady

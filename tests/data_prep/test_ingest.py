@@ -1,7 +1,5 @@
 """Ingest: a film of several cameras made here, with known starts, comes out synchronised; broken films are named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Stages killed at any place: no half result, and the same command ends with what an uninterrupted one makes."""
 
-from __future__ import annotations
-
 import runpy
 import signal
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Packed stores: the same images, cameras and samples as the files they were made of, in bounded memory."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

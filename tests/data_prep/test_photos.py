@@ -1,7 +1,5 @@
 """One reader of pictures and masks for all stages: stored pixels, every depth, every way to write a mask."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

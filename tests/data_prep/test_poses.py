@@ -1,7 +1,5 @@
 """Poses: found from photos of a corner of a room, or taken over; undistorted images, worlds turned and scaled."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

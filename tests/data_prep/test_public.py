@@ -1,7 +1,5 @@
 """Public sets become ours: poses show the true points, the world is the right one, damaged files are refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

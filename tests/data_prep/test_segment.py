@@ -1,7 +1,5 @@
 """Segment: known discs are found by every backend, masks are steady, and broken inputs are named."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

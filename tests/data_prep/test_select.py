@@ -1,7 +1,5 @@
 """Masks of a scene from texts: every term, how they are joined, what is refused, and a picture that shows them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

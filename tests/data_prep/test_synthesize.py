@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 
@@ -84,19 +82,6 @@ def test_true_motion_starts_at_rest_and_spares_the_pinned(made: Path) -> None:
             assert moved[1, ~scene.pinned].mean() > 0.005
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--objects", "jelly"], "no recipe for ['jelly']"),
-        (["--frames", "15"], "at least 16"),
-        (["--kernels", "3"], "expected at least 50"),
-    ],
-)
-def test_wrong_settings(tmp_path: Path, capsys, arguments: list[str], message: str) -> None:
-    assert main(["--quick", "--out", str(tmp_path / "set"), *arguments]) == 2
-    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
-
-
 def test_trilinear_points_follow_an_affine_motion_exactly(body: Body) -> None:
     points, frames, _ = cover_surface(body, 40, np.random.default_rng(0))
     matrix = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]])
@@ -145,16 +130,6 @@ def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
     swing = np.sqrt((motion**2).sum((1, 2)))
     left = swing[-16:].max() / swing[:16].max()
     assert 0.4 < left < 0.7 if recipe.viscosity is None else 0.2 < left < 0.35
-
-
-def test_the_least_volume_is_that_of_the_smallest_element() -> None:
-    body = BODIES["flower"]()
-    assert body.least_volume(0.5 * body.nodes[None]) == pytest.approx(0.125)
-    assert body.least_volume(body.nodes * np.array([1.0, 1.0, -2.0])) == pytest.approx(-2)
-    moved = np.stack([body.nodes, body.nodes])
-    corner = body.tetrahedra[-1]
-    moved[1, corner[0]] += 1.5 * (body.nodes[corner[1:]].mean(0) - body.nodes[corner[0]])
-    assert body.least_volume(moved) < -0.4
 
 
 @pytest.mark.parametrize("name", PUSHED)

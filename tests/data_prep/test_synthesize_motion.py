@@ -1,7 +1,5 @@
 """Bodies that fall on a floor and bodies in moving hands: physics, and what is written of them."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 from pathlib import Path

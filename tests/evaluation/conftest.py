@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 from helpers.evaluations import make_quick
 

@@ -1,10 +1,7 @@
 """What an evaluation records beside its figures: costs, sources, pictures, absent metrics."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +17,6 @@ from gausim.evaluation.recorder import PictureRecorder
 from gausim.metrics.lpips import expected_shapes
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.pictures import load_pictures
-from gausim.runs import cost
-from gausim.runs.cost import CostMeter
 from gausim.runs.provenance import code_provenance
 
 
@@ -67,26 +62,6 @@ def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "w.safetensors"))
     assert [m.key for m in default_metrics()][-1] == "lpips" and absent_metrics(31) == {}
     assert absent_metrics(30) == {"lpips": "images under 31 pixels"} and len(default_metrics(30)) == 5
-
-
-def test_the_first_sequence_warms_up(monkeypatch):
-    monkeypatch.setattr(cost, "_begin", lambda cuda: None)
-    now = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    meter = CostMeter()
-
-    def takes(seconds: float) -> str:
-        now[0] += seconds
-        return "made"
-
-    assert [meter.predict(lambda s=s: takes(s), 10) for s in (50.0, 1.0, 3.0)] == ["made"] * 3
-    meter.draw(lambda: takes(6.0), 12)
-    found = meter.summary()
-    assert found["seconds_per_frame"] == pytest.approx({"mean": 0.2, "std": 0.1})
-    assert found["frames"] == 30 and found["seconds_per_image"] == 0.5
-    only = CostMeter()
-    only.predict(lambda: takes(50.0), 10)
-    assert only.summary()["seconds_per_frame"]["mean"] == 5.0
 
 
 def git(folder: Path, *arguments: str) -> str:

@@ -1,7 +1,5 @@
 """Evaluation of bodies that fall or are moved by hands: which reference, what figures, and how they are printed."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A hand-made object directory, small enough to rebuild for every test that spoils it."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Small synthetic scenes and simulators with random, trained-looking parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """A headless Chromium driven through the DevTools protocol: pages, mouse, keyboard, pictures, requests."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json

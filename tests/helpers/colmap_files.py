@@ -1,7 +1,5 @@
 """Small COLMAP models for tests, written byte by byte as the format's description says (loaded by path, like toys)."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small elastic column under a network with random weights, and an interaction with it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """A small corpus of swaying beams with known motion and material."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

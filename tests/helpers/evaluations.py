@@ -1,7 +1,5 @@
 """Predictions without what takes most of their time."""
 
-from __future__ import annotations
-
 import pytest
 
 from gausim.runs import cost

@@ -1,7 +1,5 @@
 """Fitted methods of the toy object and what they predict."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from gausim.core import FittedMethod, FittedState, GaussianScene

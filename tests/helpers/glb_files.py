@@ -1,7 +1,5 @@
 """Binary glTF files, read as their documentation describes them."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

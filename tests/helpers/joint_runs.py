@@ -1,7 +1,5 @@
 """Settings of the smallest runs of `gausim train`, and an object beside the toy to train jointly with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

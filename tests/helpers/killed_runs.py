@@ -5,8 +5,6 @@ exit status (negative: the signal) and output, of a check of ranks what ``rank_c
 backward pass: after one, torch refuses to fork.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pydoc

@@ -1,7 +1,5 @@
 """Tensors of the device "meta", without values: what a CUDA graph can capture asks for none."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any

@@ -1,10 +1,7 @@
 """Mistakes that strangers make with a data set, each applied to a copy of a good one."""
 
-from __future__ import annotations
-
 import json
 import math
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,24 +9,10 @@ import cv2
 import numpy as np
 
 from gausim.io.ply import masks_path
-from gausim.io.video import write_video
 from helpers.plain import edit_json
 
 Json = dict
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def copy_object(source: Path, root: Path, *, scene: Path | None = None, sequences: int = 3) -> Path:
-    """Copies some sequences of an object, its facts and its rest scene, without stills and true motion."""
-    root.mkdir(parents=True)
-    shutil.copy(source / "dataset.json", root)
-    for folder in sorted((source / "sequences").iterdir())[:sequences]:
-        shutil.copytree(folder, root / "sequences" / folder.name, ignore=shutil.ignore_patterns("*.npz"))
-    ply = scene or source / "scene.ply"
-    shutil.copy(ply, root / "scene.ply")
-    if masks_path(ply).is_file():
-        shutil.copy(masks_path(ply), masks_path(root / "scene.ply"))
-    return root
 
 
 def every_transforms(root: Path, change: Callable[[Json], None]) -> None:
@@ -134,32 +117,6 @@ def not_at_rest(root: Path) -> None:
         reorder(folder, lambda number: number + 6)
 
 
-def film_for_frames(root: Path) -> None:
-    """The folder holds the camera's film under the name of the first frame."""
-    path = sorted(root.glob("sequences/*/*/*.png"))[0]
-    film = path.with_suffix(".mp4")
-    write_video(film, [np.zeros_like(cv2.imread(str(path)))] * 4, 24)
-
-    def change(data: Json) -> None:
-        for entry in data["frames"]:
-            if entry["file_path"] == f"{path.parent.name}/{path.name}":
-                entry["file_path"] = f"{path.parent.name}/{film.name}"
-
-    edit_json(path.parent.parent / "transforms.json", change)
-
-
-def films_for_folders(root: Path) -> None:
-    """The cameras' films lie in a sequence's folder instead of their frames."""
-    folder = sorted((root / "sequences").iterdir())[0]
-    film_for_frames(root)
-    film = next(folder.glob("*/*.mp4")).rename(folder / f"{views_of(root)[0]}.MP4")
-    for path in folder.iterdir():
-        if path.is_dir():
-            shutil.rmtree(path)
-        elif path != film:
-            path.unlink()
-
-
 def darker(root: Path, factor: float, every: int = 1) -> None:
     """Every so many frames of one camera are darker."""
     for path in root.glob(f"sequences/*/{views_of(root)[1]}/*.png"):
@@ -180,7 +137,6 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     "millimetres": lambda root: every_pose(root, lambda pose, _: np.vstack((pose[:3] * [1, 1, 1, 1000], pose[3:]))),
     "inverted masks": lambda root: every_alpha(root, lambda alpha: 255 - alpha),
     "nothing cut out": lambda root: every_alpha(root, lambda alpha: 255),
-    "rate times 4": lambda root: wrong_rate(root, 4),
     "rate over 4": lambda root: wrong_rate(root, 0.25),
     "rate in one file": lambda root: edit_json(root / "dataset.json", lambda data: data.update(fps=data["fps"] * 4)),
     "missing images": missing_images,
@@ -192,8 +148,6 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     "nothing moves": nothing_moves,
     "16-bit PNG": lambda root: every_image(root, lambda pixels: pixels.astype(np.uint16) * 257),
     "no alpha": lambda root: every_image(root, lambda pixels: pixels[..., :3]),
-    "a film for frames": film_for_frames,
-    "films for folders": films_for_folders,
     "no pin": lambda root: masks_path(root / "scene.ply").unlink(),
     "not at rest": not_at_rest,
     "one view": one_view,

@@ -1,7 +1,5 @@
 """What many tests make alike: scenes of round kernels, cameras that look at a place, changed JSON, pickled calls."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A small run of an elastic toy, as `load_run` gives it back, without training: for commands that push it."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Small samples exactly in the layouts of public sets: painted balls whose motion and cameras are known."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

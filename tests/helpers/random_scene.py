@@ -1,7 +1,5 @@
 """A scene of random kernels, every field another."""
 
-from __future__ import annotations
-
 import torch
 
 from gausim.core import GaussianScene

@@ -1,7 +1,5 @@
 """Checks that several ranks run together, for ``killed_runs.py``: it forks as many processes, which meet by gloo."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

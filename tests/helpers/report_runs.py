@@ -1,7 +1,5 @@
 """Run directories as `gausim train` and `gausim evaluate` leave them, with numbers that are easy to recompute."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any

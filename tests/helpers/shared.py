@@ -1,7 +1,5 @@
 """Folders that are made once per test session, whichever of its processes asks first."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

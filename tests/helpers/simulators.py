@@ -1,7 +1,5 @@
 """Simulators by flat arguments: what tests vary, whichever part it belongs to."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace

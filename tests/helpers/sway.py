@@ -1,7 +1,5 @@
 """The smallest simulator that can be trained, on the toy object: what tests of training share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path

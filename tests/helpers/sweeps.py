@@ -1,7 +1,5 @@
 """What tests of sweeps share: `gausim train -m` on a toy object in forked children that can be killed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A tiny object on disk whose motion is known by formula: a block of kernels that sways about its pinned foot."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, field

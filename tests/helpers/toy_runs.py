@@ -1,7 +1,5 @@
 """`gausim train` on the toy object, as small as it gets: once per session for all who need a trained run."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Scenes whose kernels follow units that turn, stretch and move apart."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

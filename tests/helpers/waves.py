@@ -1,7 +1,5 @@
 """Two pictures for image metrics."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

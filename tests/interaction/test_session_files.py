@@ -1,14 +1,11 @@
 """Files of sessions: read and written without loss, and refused with the field's name where they are wrong."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import pytest
 
 from gausim.core import DataError
-from gausim.interaction import session as sessions
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import (
     Entry,
@@ -108,17 +105,3 @@ def test_wrong_fields_are_named(tmp_path: Path, change, message: str) -> None:
 def test_what_is_no_session_is_refused(text: str, message: str) -> None:
     with pytest.raises(DataError, match=message):
         parse_session(text, "bad.json")
-
-
-def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch) -> None:
-    with pytest.raises(DataError, match="No such file"):
-        load_session(tmp_path / "none.json")
-    with pytest.raises(DataError, match="cannot be read"):
-        load_session(tmp_path)
-    (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="malformed|invalid|codec"):
-        load_session(tmp_path / "b.json")
-    save_session(SESSION, tmp_path / "s.json")
-    monkeypatch.setattr(sessions, "MOST_BYTES", 100)
-    with pytest.raises(DataError, match="got [0-9]+ bytes"):
-        load_session(tmp_path / "s.json")

@@ -1,7 +1,5 @@
 """COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named (see also tests/fuzz)."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 from collections.abc import Callable

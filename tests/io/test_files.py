@@ -1,7 +1,5 @@
 """Files are there whole or not at all, and killed writers leave nothing behind."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Motions as one compact file and as a page, and Gaussians as glTF: what they hold, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The page that plays a motion, in a real browser: its pictures are those of our renderer, its controls work."""
 
-from __future__ import annotations
-
 import base64
 import io
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """3DGS PLY files: what is written is read back bit by bit, and every malformed file is refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

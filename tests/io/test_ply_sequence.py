@@ -1,7 +1,5 @@
 """Numbered PLY files come back bit for bit, and incomplete or mixed folders are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

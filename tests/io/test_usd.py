@@ -1,7 +1,5 @@
 """Moving Gaussians as OpenUSD, as usd-core reads them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,9 +1,6 @@
 """The image losses against kornia and formulas, with gradients, and the objective."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -129,17 +126,3 @@ def test_gradients_of_a_mixture_are_those_of_the_sum() -> None:
     torch.testing.assert_close(leaf.grad, gradient)
     step = 1e-6 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
     torch.testing.assert_close((loss(x + step, y) - values).sum(), (gradient * step).sum(), rtol=1e-3, atol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (lambda: ImageLoss(window=4), "odd window"),
-        (lambda: Objective(mixing_weight=-1.0), "mixing_weight"),
-        (lambda: MixedLoss(), "one of them > 0"),
-        (lambda: MixedLoss(dssim=1.0, window=19)(*images()), "23x17 pixels.*window of 19"),
-    ],
-)
-def test_settings_out_of_range_are_refused(wrong: Callable[[], object], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        wrong()

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,8 +7,7 @@ from helpers.waves import pair
 from scipy.ndimage import gaussian_filter
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from gausim.core import ConfigError
-from gausim.metrics import FLIP, L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric, image, mask_iou
+from gausim.metrics import FLIP, L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric, mask_iou
 
 
 def images(seed: int = 0, count: int = 3, size: int = 24) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -106,9 +103,3 @@ def test_flip_measures_each_image_of_a_batch_by_itself() -> None:
     found = FLIP().per_image(torch.cat((first, second)), torch.cat((second, second)), torch.ones(2, 48, 64).bool())
     # The first is what a second form of the method, written from the paper, gave for these pictures.
     assert found.tolist() == pytest.approx([0.7077324390411377, 0.0], abs=2e-5)
-
-
-def test_flip_without_its_package_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(image, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match="pip install flip-evaluator"):
-        FLIP()

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import io
 import pickle
 import tarfile
@@ -12,9 +10,9 @@ from helpers.plain import Call
 from helpers.waves import pair
 from safetensors.torch import load_file, save_file
 
-from gausim.core import ConfigError, DataError
+from gausim.core import DataError
 from gausim.metrics import LPIPS
-from gausim.metrics.lpips import SHAPES, expected_shapes, weights_path
+from gausim.metrics.lpips import SHAPES, expected_shapes
 from gausim.metrics.lpips_weights import PUBLISHED, convert, digest, holds_published
 
 
@@ -85,16 +83,6 @@ def test_agrees_with_an_independent_computation(source, request, tmp_path):
         expected = independent(first[0], second[0], path)
         assert expected > 1e-3
         assert measured(path, first, second) == pytest.approx([expected], rel=1e-4)
-
-
-def test_place_of_the_weights(monkeypatch, tmp_path):
-    monkeypatch.delenv("GAUSIM_LPIPS_WEIGHTS", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert weights_path() == tmp_path / "gausim" / "lpips_alexnet.safetensors"
-    with pytest.raises(ConfigError, match="no weights for LPIPS.*gausim prepare lpips"):
-        LPIPS()
-    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(write(tmp_path / "w.safetensors", random_weights())))
-    assert LPIPS().key == "lpips"
 
 
 def test_wrong_weights_and_small_images_are_refused(tmp_path):

@@ -1,7 +1,5 @@
 """Unions of scenes as one graph, and its edges: their rules, and edges of a dummy node that keep shapes fixed."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

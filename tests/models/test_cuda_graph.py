@@ -1,7 +1,5 @@
 """That the model's step asks its device nothing, on any device, and the captured step on a GPU."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,13 +1,8 @@
-from __future__ import annotations
-
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state
-from helpers.simulators import gausim
 
-from gausim.core import ConfigError, DivergenceError, Dynamics, SceneError, SimState
+from gausim.core import DivergenceError, Dynamics, SimState
 from gausim.models.rollout.dynamics import SceneDynamics
 
 
@@ -105,28 +100,3 @@ def test_a_device_is_asked_now_and_then_and_at_the_end() -> None:
     stepper.step()
     with pytest.raises(DivergenceError, match="column0: positions are not finite at one of the frames 5 to 7"):
         stepper.settle()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"predicted_levels": (1, 2)}, "coarse to fine"),
-        ({"predicted_levels": (2, 2)}, "coarse to fine"),
-        ({"radii": (-0.1, 0.3)}, "coarse to fine"),
-        ({"predicted_levels": (), "graph_radii": ()}, "at least one"),
-        ({"edges": "both"}, "'both'; expected one of rest, union, intersection"),
-    ],
-)
-def test_contradicting_options_are_refused(options, message) -> None:
-    with pytest.raises(ConfigError, match=message):
-        gausim([make_scene(40)], [24.0], hidden=8, layers=2, **options)
-
-
-def test_scenes_without_rates_or_roots_are_refused() -> None:
-    scene = make_scene(40)
-    for scenes, fps in (([], []), ([scene], [24.0, 30.0])):
-        with pytest.raises(ConfigError, match="expected one rate per scene, at least one"):
-            gausim(scenes, fps)
-    loose = replace(scene, pinned=torch.zeros_like(scene.pinned))
-    with pytest.raises(SceneError, match="no kernel is pinned.*gausim inspect SCENE"):
-        gausim([loose], [24.0], hidden=8, layers=2)

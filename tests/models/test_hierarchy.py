@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers.bodies import make_model, make_scene

@@ -1,7 +1,5 @@
 """Models with memory: earlier frames among the inputs, carried along by rollouts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Nonlinear forces of springs and of finite strain against their energies."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

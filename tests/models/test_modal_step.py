@@ -1,7 +1,5 @@
 """The step of the modes and their springs: its solution, its energy, and how forces move it."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

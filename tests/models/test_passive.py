@@ -1,7 +1,5 @@
 """The guard of rollouts: the network cannot feed free motion, and where it does not try to nothing changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

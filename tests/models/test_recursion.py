@@ -1,7 +1,5 @@
 """The recursion against METHOD section 2's closed sum, the momentum loss, and deformations that move a lever."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state

@@ -1,7 +1,5 @@
 """Bodies that move as a whole, in hands, and onto a floor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

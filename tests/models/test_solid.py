@@ -1,7 +1,5 @@
 """Modes of the solid body: splines, energies and inertia against closed forms, modes against theory of bars."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

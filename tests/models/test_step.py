@@ -1,7 +1,5 @@
 """Invariants of one step and of rollouts (METHOD sections 1, 2 and 6)."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

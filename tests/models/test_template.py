@@ -1,7 +1,5 @@
 """What the simulator does with a template and what it shows to the network."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state

@@ -1,7 +1,5 @@
 """Planes of features: bilinear values, borders, products and sums, penalties by hand."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -52,10 +50,3 @@ def test_penalties_look_along_their_own_axes() -> None:
         planes.planes[2].copy_(torch.tensor([0.0, 1, 0, 1])[:, None].expand(4, 3))
         planes.planes[0].copy_(torch.tensor([0.0, 1, 2]).expand(3, 3))  # (x, y): slope 1 along x
     assert float(planes.unsteadiness()) == pytest.approx(4) and float(planes.variation()) == pytest.approx(1)
-
-
-def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="3 or 4 axes"):
-        Planes([4, 4])
-    with pytest.raises(ValueError, match="'mean'"):
-        Planes([4, 4, 4], combine="mean")

@@ -1,7 +1,5 @@
 """Random scenes and cameras for the renderers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +30,7 @@ class Inputs:
     def tensors(self) -> tuple[Tensor, ...]:
         return self.means, self.covars, self.colors, self.opacities, self.background
 
-    def to(self, *kind: torch.dtype | str) -> Inputs:
+    def to(self, *kind: torch.dtype | str) -> "Inputs":
         names = ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background")
         return replace(self, **{name: getattr(self, name).detach().to(*kind).clone() for name in names})
 

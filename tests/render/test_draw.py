@@ -1,7 +1,5 @@
 """Deformed scenes: covariances, colours by direction, masks, trajectories."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +12,7 @@ from gausim.core import Cameras, ConfigError, Rendered, Trajectory
 from gausim.ops.rotation import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import SceneAppearance, deformed_appearance, draw, film
+from gausim.render.draw import SceneAppearance, deformed_appearance, draw, film, to_bytes
 from gausim.render.reference import ReferenceRenderer
 
 COUNT, UNITS = 12, 3
@@ -94,7 +92,7 @@ def test_mask_draws_the_kernels_it_names(scene: Callable, cameras: Cameras, unit
         image(SceneAppearance.of(still), positions, units, mask=mask)
 
 
-def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, units: Tensor) -> None:
+def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, units: Tensor, monkeypatch) -> None:
     still = scene(COUNT, 1)
     deformation_gradients, rotations = (x.float() for x in deformation(5))
     positions = (still.means + torch.linspace(0, 0.2, 5)[:, None, None]).float()
@@ -108,9 +106,8 @@ def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, u
         drawn.append(len(means))
         return renderer(means, *inputs, **options)
 
-    exact = film(noted, still, trajectory, cameras, background=behind, as_bytes=False, chunk=2)
-    assert drawn == [2, 2, 1] and torch.equal(exact, expected)
-    frames = film(renderer, still, trajectory, cameras, background=behind, chunk=3)
-    assert frames.dtype == torch.uint8 and frames.shape == (5, 2, cameras.height, cameras.width, 3)
+    monkeypatch.setattr("gausim.render.draw.AT_A_TIME", 2)
+    frames = film(noted, still, trajectory, cameras, background=behind)
+    assert drawn == [2, 2, 1] and torch.equal(frames, to_bytes(expected))
     assert float((frames.float() / 255 - expected.clamp(0, 1)).abs().max()) <= 0.5 / 255 + 1e-6
     assert math.isclose(float(frames.max()), 255)

@@ -1,19 +1,66 @@
-"""The CUDA renderer: what it hands to gsplat (a stand-in drawn by the reference), its refusals; on a GPU, parity."""
-
-from __future__ import annotations
+"""The choice of a renderer, and gsplat behind it."""
 
 import importlib.util
+import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import ModuleType
 
 import pytest
 import torch
 
 from gausim.core import ConfigError, Rendered
+from gausim.render import auto
 from gausim.render import gsplat as backend
+from gausim.render.auto import AutoRenderer, chosen
+from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
 from gausim.render.reference import ReferenceRenderer
+
+REASON = "gsplat is not installed (pip install 'gausim[gpu]')"
+
+
+@pytest.fixture(autouse=True)
+def first_time(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """As in a new process."""
+    caplog.set_level(logging.INFO, "gausim")
+    chosen.cache_clear()
+    yield
+    chosen.cache_clear()
+
+
+def test_on_the_cpu_it_is_the_cpu_renderer(inputs: Callable, caplog: pytest.LogCaptureFixture) -> None:
+    given = inputs(2, 2, 80, (34, 22)).to(torch.float32)
+    images, deformation_gradients = given.draw_with_gradients(AutoRenderer(threads=2))
+    expected, expected_gradients = given.draw_with_gradients(CpuRenderer(threads=2))
+    assert torch.equal(images.rgb, expected.rgb) and torch.equal(images.alpha, expected.alpha)
+    assert all(torch.equal(a, b) for a, b in zip(deformation_gradients, expected_gradients, strict=True))
+    said = [record.getMessage() for record in caplog.records if "render=auto" in record.getMessage()]
+    assert len(said) == 1 and "by the CPU renderer, not by gsplat: " in said[0]
+
+
+@pytest.mark.parametrize(("reason", "choice"), [(None, "gsplat"), (REASON, "cpu")])
+def test_on_cuda_it_is_gsplat_or_says_why_not(reason, choice, monkeypatch, caplog) -> None:
+    asked = []
+    monkeypatch.setattr(auto.gsplat, "unavailable", lambda: asked.append(1) or reason)
+    assert [chosen("cuda"), chosen("cuda")] == [choice, choice]
+    assert len(asked) == 1 and len(caplog.records) == 1
+    message = caplog.records[0].getMessage()
+    assert "\n" not in message
+    assert caplog.records[0].levelno == (logging.INFO if reason is None else logging.WARNING)
+    assert ("by gsplat on the GPU" if reason is None else f"slow, because {REASON}.") in message
+
+
+@pytest.mark.gpu
+def test_gpu_tensors_without_gsplat_are_drawn_on_the_cpu_and_return(inputs, monkeypatch) -> None:
+    monkeypatch.setattr(auto.gsplat, "unavailable", lambda: REASON)
+    given = inputs(2, 2, 80, (34, 22)).to(torch.float32)
+    expected, expected_gradients = given.draw_with_gradients(CpuRenderer())
+    images, deformation_gradients = given.to("cuda").draw_with_gradients(AutoRenderer())
+    assert images.rgb.device.type == "cuda" and torch.equal(images.rgb.cpu(), expected.rgb)
+    for value, truth in zip(deformation_gradients, expected_gradients, strict=True):
+        assert value.device.type == "cuda"
+        torch.testing.assert_close(value.cpu(), truth)
 
 
 def rasterization(
@@ -91,21 +138,6 @@ def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleTy
         inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(GsplatRenderer())
     with pytest.raises(ConfigError, match=r"render.near: expected more than 0, got 0\.0"):
         GsplatRenderer(near=0.0)
-
-
-def test_it_draws_only_where_all_of_gsplat_is_there(inputs: Callable, stand_in: ModuleType, monkeypatch) -> None:
-    assert backend.unavailable() is None
-    given, kernels = inputs(2, 2, 5, (8, 8)).to(torch.float32), sys.modules["gsplat.cuda._backend"]
-    for change, reason in (
-        (lambda: monkeypatch.setattr(kernels, "_C", None), "no CUDA toolkit"),
-        (lambda: monkeypatch.delattr(kernels, "_C"), "do not build or load"),
-        (lambda: monkeypatch.setattr(stand_in, "__version__", "1.6.0"), "1.6.0, expected 1.5.3"),
-        (lambda: monkeypatch.setattr(importlib.util, "find_spec", lambda name: None), "not installed"),
-    ):
-        change()
-        assert reason in str(backend.unavailable())
-        with pytest.raises(ConfigError, match=reason):
-            given.draw(GsplatRenderer())
 
 
 @pytest.mark.gpu

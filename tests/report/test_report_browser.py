@@ -1,7 +1,5 @@
 """The page of a report in Chromium: its video plays, runs are chosen without a script, nothing overflows a phone."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 from helpers import report_runs
 from helpers.report_runs import config, evaluate, make_curves, study_of, write_run
 
-from gausim.report.commands import joined
 from gausim.report.runs import find_runs
 from gausim.report.study import EFFECT, EFFECT_SIGMA, Study
 from gausim.results.table import Cell
@@ -172,23 +169,6 @@ def test_why_there_is_no_number(sweep):
     (failed / "FAILED").write_text("")
     (group,) = [g for g in study_of(sweep).groups if g.variation == "w/o momentum"]
     assert group.state("toy_bunny", "l2") == "failed" and len(group.runs) == 2
-
-
-def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs():
-    start = "gausim train experiment=tables/comparison"
-    jobs = [f"{start} method={m} seed={s} ++plan.clock=cpu output_root=/x" for m in "ab" for s in (0, 1)]
-    jobs += [f"{start} method=c seed=0 ++plan.clock=cpu output_root=/x", "gausim train model=m init_from=o/r"]
-    assert joined(jobs) == [
-        f"gausim train -m {start[13:]} method=a,b seed=0,1 plan.clock=cpu",
-        f"gausim train {start[13:]} method=c seed=0 plan.clock=cpu",
-        "gausim train model=m init_from=o/r",
-    ]
-    assert joined(
-        ["gausim train -m 'data.sequences=[a,b]' seed=0,1", "gausim train 'data.sequences=[a,b]' seed=2"]
-    ) == ["gausim train -m 'data.sequences=[a,b]' seed=0,1,2"]
-    assert joined(["gausim train output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
-        "gausim train init_from=outputs/run", "not recorded",
-    ]  # fmt: skip
 
 
 def test_what_makes_runs_incomparable_is_noted(tmp_path):

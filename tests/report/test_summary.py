@@ -1,7 +1,5 @@
 """From per-frame figures to the long table, by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables of reports, their files, pages made from records, and the figures of the repository's own pages."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
@@ -16,12 +14,10 @@ from helpers.report_runs import config, evaluate, grids_of, make_curves, page_of
 from gausim.cli import main as cli
 from gausim.core import RunError
 from gausim.report.layouts import summary
-from gausim.report.opening import first_grid
 from gausim.report.paper import CONTRAST, TABLES, paper_object
 from gausim.report.render import page
 from gausim.report.runs import find_runs
 from gausim.report.study import Study
-from gausim.report.verdict import outcome, sentences
 from gausim.results.pivot import Pivot, cell_texts, markdown_table
 from gausim.results.table import SCHEMA, Cell, Entry, Made, Metric, ObjectInfo, Results, load_results, save_results
 
@@ -184,20 +180,6 @@ def test_bounces_of_methods_references_and_the_truth(tmp_path: Path) -> None:
     rows = shown(grids_of(tmp_path)["toy_bunny, bounce"])
     assert rows["gausim"] == ["0.450 ± 0.071", "10.0 ± 0.0", "0.200 ± 0.000", "25.0 ± 0.0", "0.30 ± 0.00"]
     assert rows["ballistic"][2] == "" and rows["truth"][1] == "0"
-
-
-@pytest.mark.parametrize(
-    ("reference", "words"),
-    [("ballistic", "rigid flight"), ("follow hands", "the hands' motion alone"), ("static", "no motion")],
-)
-def test_sentences_and_first_table_name_the_reference(tmp_path: Path, reference: str, words: str) -> None:
-    study = falling_study(tmp_path, reference)
-    (group,) = study.groups
-    info = study.results.objects["toy_bunny"]
-    assert f"a model that predicts {words}" in sentences(outcome(study.pivot, "toy_bunny", "gausim", info))[0]
-    grid = first_grid(study, group, "toy_bunny")
-    assert f"3D ÷ {reference}" in [column.label for column in grid.columns]
-    assert [line.label for line in grid.lines] == ["seen 0–15", "unseen 16–49", words] and words in grid.caption
 
 
 # --------------------------------------------------------------------------------------------------------------- files

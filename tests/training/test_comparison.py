@@ -1,6 +1,4 @@
-"""Drawing and comparing in chunks against the plain way."""
-
-from __future__ import annotations
+"""Drawing and comparing in chunks against the plain way, and what a training step holds."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,20 +6,22 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import sway, toy_object
+from helpers.sway import blobs, sample
 from torch import Tensor
 
 from benchmarks.harness import peak_saved_bytes
 from gausim.core import GaussianScene, Renderer
 from gausim.data.images import composite
-from gausim.losses import ImageLoss
+from gausim.losses import ImageLoss, Objective
 from gausim.models.hierarchy.batch import Member
 from gausim.render.draw import SceneAppearance, draw
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
 from gausim.training.rollout import States
+from gausim.training.supervision import comparison
 from gausim.training.supervision import comparison as chunked
 from gausim.training.supervision.comparison import Comparison, ViewGroup
 
-blobs = sway.blobs
 SCENES = (0, 1, 0)  # of the three members
 STATE = 3 * toy_object.SIZE**2  # pixels of one
 
@@ -111,3 +111,32 @@ def test_no_image_is_held_for_the_backward_pass(monkeypatch: pytest.MonkeyPatch)
     assert held[12] - held[3] <= 9 * states
     one_image = 8 * 3 * STATE
     assert states < one_image  # so the bound above tells states from images
+
+
+def real_module(objective: Objective) -> GausSimModule:
+    parts = {"renderer": blobs, "objective": objective}
+    return sway.real_module(edges="rest", layers=2, output_scale=0.1, parts=parts)
+
+
+def optimise(module: GausSimModule, steps: int = 3, times: int = 1) -> dict[str, float]:
+    optimizer = module.configure_optimizers()
+    stats: dict[str, float] = {}
+    for number in range(times):
+        stats = module.optimise([sample(0, steps=steps)], optimizer, torch.Generator().manual_seed(number))
+    return stats
+
+
+@pytest.fixture
+def one_state_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "CPU_PIXELS", 1)
+
+
+def held(objective: Objective, steps: int) -> int:
+    return peak_saved_bytes(lambda: optimise(real_module(objective), steps))
+
+
+def test_memory_does_not_grow_with_the_rollout_where_gradients_stop(one_state_at_once: None) -> None:
+    stopped = Objective(backprop_steps=1, static_weight=0.0)
+    assert held(stopped, 8) == held(stopped, 3) > 0
+    whole = Objective(backprop_steps=0, static_weight=0.0)
+    assert held(whole, 12) > 2 * held(whole, 3)

@@ -1,18 +1,11 @@
 """Several ranks do together what one rank does with all sequences (see rank_checks.py for what runs in them)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.toy_runs import Trainings
-
-from gausim.core import ConfigError
-from gausim.training.ranks.launch import joined
-from gausim.training.ranks.layout import Layout
-from gausim.training.trainer import TrainerSettings, make_trainer
 
 # The static loss is one rank's: all that could depend on which rank computes a sequence.
 ALL = {"static_probability": 1.0}
@@ -103,22 +96,3 @@ def test_what_the_first_rank_finds_the_others_hear(ask: Ask) -> None:
 def test_weights_that_drift_apart_are_noticed(ask: Ask) -> None:
     found = ask("drifted", 4)
     assert all("weights: expected the same on all ranks" in text and "ranks [2, 3]" in text for text in found)
-
-
-def test_wrong_layouts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    for wrong in ({"devices": 0}, {"num_nodes": 0}):
-        with pytest.raises(ConfigError, match=r"trainer: expected devices >= 1"):
-            Layout(**wrong)
-    with pytest.raises(ConfigError, match=r"trainer.devices: expected 1 without a run directory"):
-        make_trainer(TrainerSettings(devices=2), epochs=1)
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    slurm = {"SLURM_NTASKS": "3", "SLURM_NTASKS_PER_NODE": "3", "SLURM_JOB_NAME": "train"}
-    for environment, layout, words in (
-        ({}, Layout(num_nodes=2, accelerator="cpu"), r"num_nodes: 2 machines need a scheduler"),
-        ({}, Layout(2, accelerator="gpu"), r"2 ranks need as many GPUs, this machine has 1"),
-        (slurm, Layout(2, accelerator="cpu"), r"the scheduler started 3 ranks, expected devices x num_nodes = 2 x 1"),
-    ):
-        for name, value in environment.items():
-            monkeypatch.setenv(name, value)
-        with pytest.raises(ConfigError, match=words), joined(layout):
-            pass

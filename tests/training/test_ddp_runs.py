@@ -1,7 +1,5 @@
 """Runs of two ranks through the command line: killed and resumed to the same bits, one after the other in a sweep."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """The regulariser of free motion: growth by formula, its gradient, and what training logs and refuses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
@@ -11,9 +9,9 @@ import torch
 from helpers import sway
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, Frame, SimState
+from gausim.core import Frame, SimState
 from gausim.losses.objective import EnergyLoss, Objective
-from gausim.models.template.template import RestTemplate, Template
+from gausim.models.template.template import Template
 from gausim.training.graphed import GraphedRollouts
 from gausim.training.module import GausSimModule
 from gausim.training.terms.free_motion import energy_growth
@@ -100,13 +98,3 @@ def test_members_of_several_scenes_have_their_own_energies() -> None:
         torch.testing.assert_close(together[i : i + 1], alone)
     assert bool((together > 0).all())
     assert float(model.energy(batch, SimState(batch.rest, batch.rest)).abs().max()) < 1e-9
-
-
-def test_models_and_templates_without_energy_are_refused_and_null_asks_those_that_have_one() -> None:
-    asked = Objective(energy=EnergyLoss(weight=1.0))
-    with pytest.raises(ConfigError, match=r"energy.weight is 1.0, but Sway knows no energy"):
-        sway_module(objective=asked)
-    with pytest.raises(ConfigError, match=r"energy.weight is 1.0, but RestTemplate knows no energy"):
-        _module(asked, RestTemplate)
-    either = Objective(energy=EnergyLoss(weight=None))
-    assert [_module(either, template).free_motion.weight for template in (RestTemplate, ELASTIC)] == [0.0, 1.0]

@@ -1,7 +1,5 @@
 """Rollouts of optimiser steps as CUDA graphs."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -14,7 +12,6 @@ from torch.profiler import ProfilerActivity, profile
 
 from gausim.kernels.operations import plain_forms
 from gausim.losses.objective import EnergyLoss, Objective
-from gausim.models.settings import RolloutSettings
 from gausim.models.template.material import MaterialTemplate
 from gausim.models.template.template import RestTemplate
 from gausim.training.graphed import GraphedRollouts, _Stretch
@@ -99,11 +96,6 @@ def test_no_operation_of_a_backward_pass_reads_a_number(template: Any) -> None:
         torch.autograd.grad(made, trained, [torch.ones_like(x) for x in made], allow_unused=True)
     read = [event.cpu_parent.cpu_parent for event in seen.events() if event.name == "aten::_local_scalar_dense"]
     assert {parent.name for parent in read} <= {"aten::linalg_lu_solve"}  # which checks its pivots on the CPU only
-
-
-def test_only_rollouts_of_fixed_shape_are_captured_and_only_on_a_device() -> None:
-    module = module_on("cpu")
-    assert module.simulator.rollout.cuda_graph == RolloutSettings().cuda_graph and not module.graphs.serves
 
 
 @pytest.mark.gpu

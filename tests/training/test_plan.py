@@ -1,7 +1,5 @@
 """The training plan: what it decides for every recipe, and that a saved configuration states what ran."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training on true points against plain formulas and the numbers of the evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
@@ -10,7 +8,7 @@ import torch
 from helpers import sway, toy_object
 from torch import Tensor
 
-from gausim.core import DataError, GaussianScene, SimState, Trajectory
+from gausim.core import GaussianScene, SimState, Trajectory
 from gausim.data.records import GroundTruth
 from gausim.losses import ImageLoss, Objective
 from gausim.metrics import point_error
@@ -110,12 +108,6 @@ def test_the_rest_state_scores_the_true_displacement_and_only_of_the_samples_fra
     step = 100 * known.positions[:4].diff(dim=0).norm(dim=-1) / SCENE.diagonal
     assert motion == pytest.approx(step.square().mean(1).tolist(), rel=1e-5)
     assert supervision.static(sample(0, 3), SCENE.means, 2).losses == losses[2:]
-
-
-def test_unknown_motion_is_refused_by_name() -> None:
-    supervision = PointSupervision(sources(lambda number: None))
-    with pytest.raises(DataError, match=r"toy/seq_0: its true motion is not known.*supervision=images"):
-        supervision.static(sample(0), SCENE.means, 0)
 
 
 def test_a_module_learns_from_points_and_draws_nothing() -> None:

@@ -1,7 +1,5 @@
 """A run that dies anywhere and is started again leaves bit for bit what it would have left undisturbed."""
 
-from __future__ import annotations
-
 import json
 import random
 from pathlib import Path

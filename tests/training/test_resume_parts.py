@@ -1,7 +1,5 @@
 """The parts of an exact resume, each by itself."""
 
-from __future__ import annotations
-
 import random
 import time
 from pathlib import Path
@@ -70,21 +68,6 @@ def test_saves_come_by_steps_and_by_minutes_within_an_epoch(monkeypatch: pytest.
     assert steps_saved(RunCheckpoint(every_minutes=0)) == []
     assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5)) == [-1, 5, -1, 10]
     assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [-1, 6, -1, 11]  # its end saves that
-
-
-def test_a_resumed_run_goes_on_with_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [1000.0]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    cost = TrainingCost()
-    now[0] += 30.0
-    assert cost.minutes("wall") == 0.5
-    state = cost.state_dict()
-    now[0] += 500.0  # nobody trains
-    resumed = TrainingCost()
-    resumed.load_state_dict(state)
-    assert resumed.minutes("wall") == 0.5
-    now[0] += 15.0
-    assert resumed.minutes("wall") == 0.75
 
 
 def test_cost_goes_on_where_a_checkpoint_ended() -> None:

@@ -1,7 +1,5 @@
 """Teaching: the network learns the flow from single steps and rollouts on tracks, and a resumed run keeps it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

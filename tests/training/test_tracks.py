@@ -1,7 +1,5 @@
 """Motion tracked in images against the motion that they were drawn from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -113,14 +111,6 @@ def test_twenty_barren_batches_are_a_divergence(tmp_path: Path) -> None:
         module.model.drift[0] += 1.0
     with pytest.raises(DivergenceError, match="20 batches in a row"):
         fit(module, [[sample(0)]] * 25, tmp_path)
-
-
-def test_a_collapse_is_warned_of_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gausim.training.module.COLLAPSE_AFTER", 4)
-    module = sway_module(Objective(static_weight=0.0), network_lr=0.0, scene_lr=0.0, initial_lr=0.0)
-    with pytest.warns(UserWarning, match="collapsed to the rest state") as caught:
-        fit(module, [[sample(0, steps=1)]] * 2, tmp_path, epochs=4)
-    assert sum("collapsed" in str(w.message) for w in caught) == 1
 
 
 def test_clipping_by_group_and_altogether() -> None:

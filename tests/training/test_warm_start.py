@@ -1,7 +1,5 @@
 """The start of a training from tracked motion: what is found, and that a resumed run keeps it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

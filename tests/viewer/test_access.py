@@ -1,7 +1,5 @@
 """Access control of the viewer: hosts, origins, paths and tokens that are refused, and clients that send rubbish."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 from collections.abc import Iterator

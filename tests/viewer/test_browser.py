@@ -1,7 +1,5 @@
 """The viewer in a real browser: the page loads, a drag moves the object where it goes, sessions replay bit for bit."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

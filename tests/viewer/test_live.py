@@ -1,7 +1,5 @@
 """The viewer's simulating thread: what is done to it, played back, undone and stopped."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time
@@ -20,7 +18,7 @@ from gausim.core import ConfigError
 from gausim.interaction import interaction as interaction_module
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
-from gausim.interaction.selections import Ball, Unit, Whole
+from gausim.interaction.selections import Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
 from gausim.viewer.live import Companion, Live
 from gausim.viewer.pointer import Pointer
@@ -160,22 +158,6 @@ def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interactio
         one.advance()
         assert one.shown().number == number % 6 and one.shown().last == 5
     assert interaction.tick == 0
-
-
-def test_a_companion_feels_the_same(make_interaction: Callable[..., Interaction]) -> None:
-    leader, follower = make_interaction(), make_interaction()
-    other = Companion("the same again", follower)
-    one = Live(leader, lambda _: None, companion=other)
-    for event in (Force(Unit(2, 0), (1.0, 0, 0), 1.0), Impulse(Ball((0.3, 0.3, 1.0), 0.3), (0.0, 1.0, 0.0), 0.05)):
-        one.act(event)
-        for _ in range(3):
-            one.advance()
-    assert torch.equal(leader.frame.positions, follower.frame.positions)
-    assert float((leader.frame.positions - leader.scene.means).abs().max()) > 0
-    beside = one.shown().beside
-    assert beside is not None and torch.equal(beside.frame.positions, follower.frame.positions)
-    one.reset()
-    assert torch.equal(follower.frame.positions, follower.scene.means)
 
 
 def test_a_companion_replays_with_the_gravity_and_the_gusts_of_the_session(make_interaction) -> None:

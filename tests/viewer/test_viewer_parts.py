@@ -1,7 +1,5 @@
 """The viewer's parts without a browser: packing, colours, picking, queues."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable
@@ -17,10 +15,9 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 from gausim.core import Frame, GaussianScene
 from gausim.interaction.interaction import Interaction
-from gausim.models.template.template import Property
 from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
-from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, hues
+from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter
 from gausim.viewer.pipeline import Worker
 from gausim.viewer.pointer import first_hit, in_rectangle
 from gausim.viewer.splats import Placing, half_covariances, pack
@@ -87,25 +84,6 @@ def test_every_mode_colours_every_kernel(painter: tuple[Painter, Interaction]) -
     other = painted(paint, interaction, VIEW, -eye)[1]
     assert not torch.allclose(other, seen[VIEW], atol=1e-3)
     assert torch.equal(painted(paint, interaction, BASE, -eye)[1], seen[BASE])
-
-
-def test_the_learned_material_is_a_mode(make_interaction: Callable[..., Interaction]) -> None:
-    interaction = make_interaction()
-    values = torch.linspace(0.5, 2, interaction.scene.count)
-    values[3] = torch.nan
-    paint = Painter(interaction.scene, (), interaction.masses, {"stiffness": Property(values, "stiffness")})
-    rgb = painted(paint, interaction, "Stiffness", torch.ones(3))[1]
-    assert "Stiffness" in paint.modes and torch.equal(rgb[3], torch.full((3,), 0.5)) and len(rgb.unique(dim=0)) > 20
-
-
-def test_hierarchy_has_one_colour_per_unit(painter: tuple[Painter, Interaction]) -> None:
-    paint, interaction = painter
-    for level, units in enumerate(interaction.units):
-        rgb = painted(paint, interaction, paint.modes[2 + level], torch.ones(3))[1]
-        for unit in range(int(units.max()) + 1):
-            assert len(rgb[units == unit].unique(dim=0)) == 1
-    table = hues(torch.arange(60))
-    assert float(torch.pdist(table).min()) > 0.01 and torch.equal(hues(torch.tensor([-1]))[0], torch.full((3,), 0.5))
 
 
 def test_strain_is_the_largest_logarithm_of_a_stretch(painter: tuple[Painter, Interaction]) -> None:

@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, Rendered, Renderer, Trajectory
 from gausim.kernels.operations import operation
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+
+# Frames that are drawn at a time.
+AT_A_TIME = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,19 +137,13 @@ def film(
     *,
     mask: Bool[Tensor, " K"] | None = None,
     background: Float[Tensor, " 3"] | None = None,
-    as_bytes: bool = True,
-    chunk: int = 16,
-) -> Tensor:
-    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped).
-
-    They are drawn ``chunk`` frames at a time, without loss gradients.
-    """
+) -> UInt8[Tensor, "F V H W 3"]:
+    """All frames of a trajectory, a few at a time, without loss gradients."""
     look, parts = SceneAppearance.of(scene, mask) if isinstance(scene, GaussianScene) else scene, []
-    for start in range(0, trajectory.frames, chunk):
-        now = trajectory.part(slice(start, start + chunk))
+    for start in range(0, trajectory.frames, AT_A_TIME):
+        now = trajectory.part(slice(start, start + AT_A_TIME))
         state = now.positions, now.deformation_gradients, now.rotations, trajectory.unit_of_kernel
-        rgb = draw(renderer, look, *state, cameras, background=background).rgb
-        parts.append(to_bytes(rgb) if as_bytes else rgb)
+        parts.append(to_bytes(draw(renderer, look, *state, cameras, background=background).rgb))
     return torch.cat(parts)
 
 

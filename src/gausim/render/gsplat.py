@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.render.reference import DILATION, require_options
+from gausim.render.reference import DILATION, checked_near
 
-VERSION, ALPHA_MAX = "1.5.3", 0.999  # the ceiling of alpha is compiled in; on gsplat's main branch it is 0.99
+VERSION = "1.5.3"  # with the ceiling of alpha that is compiled in
 DEVICE = "cuda"  # the type of the devices that gsplat draws on
 INSTALL = "pip install 'gausim[gpu]'"
 
@@ -61,8 +61,7 @@ class GsplatRenderer:
         Raises:
             ConfigError: an option is out of range.
         """
-        require_options(near, ALPHA_MAX)
-        self.near = near
+        self.near = checked_near(near)
 
     def __call__(
         self,

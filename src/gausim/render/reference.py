@@ -10,17 +10,17 @@ from gausim.core import ConfigError, Rendered
 
 DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
 ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.999  # ceiling of a kernel's opacity at a pixel; compiled into gsplat 1.5.3 (0.99 on its main branch)
 CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by this fraction
 T_STOP = 1e-4  # a kernel that would leave less transmittance than this ends its pixel (3DGS)
 TILE = 16  # [pixels]
 
 
-def require_options(near: float, alpha_max: float) -> None:
-    """Raises :class:`ConfigError` where an option common to all renderers is out of range."""
+def checked_near(near: float) -> float:
+    """The option ``near`` of all renderers; raises :class:`ConfigError` where it is out of range."""
     if not near > 0:
         raise ConfigError(f"render.near: expected more than 0, got {near}.")
-    if not 0 < alpha_max < 1:
-        raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
+    return near
 
 
 class ReferenceRenderer:
@@ -30,18 +30,16 @@ class ReferenceRenderer:
     pixel, so the result equals the sum over all kernels. Memory grows with the kernels of the fullest tile.
     """
 
-    def __init__(self, *, near: float = 0.01, alpha_max: float = 0.999) -> None:
+    def __init__(self, *, near: float = 0.01) -> None:
         """Sets the options.
 
         Args:
             near: kernels closer than this to the camera plane are dropped [scene units].
-            alpha_max: ceiling of a kernel's opacity at a pixel (gsplat 1.5.3: 0.999).
 
         Raises:
             ConfigError: an option is out of range.
         """
-        require_options(near, alpha_max)
-        self.near, self.alpha_max = near, alpha_max
+        self.near = checked_near(near)
 
     def __call__(
         self,
@@ -106,7 +104,7 @@ class ReferenceRenderer:
         dy = (axis + top)[:, None, None] - k[:, 1]  # (y, 1, m)
         power = -(0.5 * k[:, 2] * dx * dx + dy * (k[:, 3] * dx + 0.5 * k[:, 4] * dy)).reshape(TILE * TILE, -1)
         raw = k[:, 5] * torch.exp(power)
-        alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp_max(self.alpha_max), 0.0)
+        alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), 0.0)
         through = torch.cumprod(1 - alpha, 1)
         keep = through.detach() > T_STOP  # a prefix of the kernels, because the product never grows
         before = torch.cat((torch.ones_like(through[:, :1]), through[:, :-1]), 1)

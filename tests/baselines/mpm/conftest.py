@@ -1,7 +1,5 @@
 """Blocks of particles in small domains."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import pytest

@@ -96,7 +96,6 @@ class Batch:
     width: int
     height: int
     near: float
-    alpha_max: Any  # np.float32: the kernels are compiled for that type
     views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @cached_property
@@ -131,7 +130,7 @@ class Batch:
         def draw(item: tuple[int, int, int]) -> None:
             b, v, index = item
             band = self.bin(b, v, index)
-            forward_band(*band.kernels, self.background, self.alpha_max, *images.of(b, v), *band.seen)
+            forward_band(*band.kernels, self.background, *images.of(b, v), *band.seen)
             self.views[b, v].bands[index] = band if keep else None
 
         def draw_all(pairs: Sequence[tuple[int, int]], run: Callable[..., None]) -> None:
@@ -238,7 +237,7 @@ class Batch:
         band, sums, offsets = view.bands[index], view.sums, view.offsets
         assert band is not None and sums is not None and offsets is not None
         backward_band(
-            *band.kernels, self.background, self.alpha_max, *grads.of(b, v), *band.seen,
+            *band.kernels, self.background, *grads.of(b, v), *band.seen,
             sums[offsets[index] : offsets[index + 1]], None if background is None else background[item],
         )  # fmt: skip
 

@@ -26,9 +26,11 @@ from gausim.render.cpu.projection import (
     S_YY,
     S,
 )
+from gausim.render.reference import ALPHA_MAX
 
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 PAIR = 2 * TILE_WIDTH  # pixels of two rows, the unit of the entries' row ranges
+MOST = np.float32(ALPHA_MAX)
 T_STOP = np.float32(1e-4)  # a kernel that would leave less transmittance than this ends its pixel (3DGS)
 CHECK_EVERY = 8  # kernels between two checks whether a pixel of the tile is still open
 
@@ -64,7 +66,7 @@ def mean_in_tile(records, g, left, top):
 
 
 @numba.njit(fastmath=True, **HELPER)
-def forward_tile(records, entries, begin, end, left, top, alpha_max, buf):
+def forward_tile(records, entries, begin, end, left, top, buf):
     """Composites the entries ``begin .. end - 1`` into ``buf`` = [T | R | G | B | last | x | y] (7, PIXELS).
 
     T turns negative where the pixel is closed; ``last`` is the row of the last kernel that contributed.
@@ -92,7 +94,7 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf):
         for i in range(((packed >> 4) & 15) * PAIR, (packed & 15) * PAIR + PAIR):
             dx, dy = buf[5 * PIXELS + i] - mx, buf[6 * PIXELS + i] - my
             u = dx * (a * dx + b * dy) + c * dy * dy
-            alpha = min(o * exponential(u), alpha_max) if u >= cut else ZERO
+            alpha = min(o * exponential(u), MOST) if u >= cut else ZERO
             t = buf[i]
             after = t - t * alpha
             keep = after > T_STOP
@@ -106,7 +108,7 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf):
 
 
 @numba.njit(fastmath=True, **HELPER)
-def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums):
+def backward_tile(records, entries, begin, end, left, top, buf, sums):
     """Adds the tile's part to ``sums`` (rows, SUMS); ``buf`` = [T | B | vr | vg | vb | last | x | y] (8, PIXELS).
 
     Runs back to front: B is the derivative with respect to the transmittance behind the current kernel, by the
@@ -130,14 +132,14 @@ def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums)
             dx, dy = buf[6 * PIXELS + i] - mx, buf[7 * PIXELS + i] - my
             u = dx * (a * dx + b * dy) + c * dy * dy
             raw = o * exponential(u)
-            alpha = min(raw, alpha_max) if (u >= cut) & (buf[5 * PIXELS + i] >= row) else ZERO
+            alpha = min(raw, MOST) if (u >= cut) & (buf[5 * PIXELS + i] >= row) else ZERO
             t = buf[i] / (ONE - alpha)
             buf[i] = t
             w = alpha * t
             vr, vg, vb = buf[2 * PIXELS + i], buf[3 * PIXELS + i], buf[4 * PIXELS + i]
             gap = vr * red + vg * green + vb * blue - buf[PIXELS + i]
             buf[PIXELS + i] += alpha * gap
-            s = w * gap if raw <= alpha_max else ZERO  # at its ceiling alpha does not depend on the exponent
+            s = w * gap if raw <= MOST else ZERO  # at its ceiling alpha does not depend on the exponent
             sx, sy = s * dx, s * dy
             m0 += s
             m1 += sx
@@ -160,7 +162,7 @@ def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums)
 
 
 @numba.njit(fastmath=True, **KERNEL)
-def forward_band(records, entries, start, row_low, background, alpha_max, rgb, alpha, final, last, used):
+def forward_band(records, entries, start, row_low, background, rgb, alpha, final, last, used):
     """Draws one band into ``rgb`` (H, W, 3) and ``alpha`` (H, W).
 
     ``final`` and ``last`` (tiles, PIXELS) receive the remaining transmittance and the row of the last kernel that
@@ -172,7 +174,7 @@ def forward_band(records, entries, start, row_low, background, alpha_max, rgb, a
     write_grid(buf, 5 * PIXELS)
     for tile in range(start.shape[0] - 1):
         top, left = row_low + tile // strips * TILE_HEIGHT, tile % strips * TILE_WIDTH
-        used[tile] = forward_tile(records, entries, start[tile], start[tile + 1], left, top, alpha_max, buf)
+        used[tile] = forward_tile(records, entries, start[tile], start[tile + 1], left, top, buf)
         for i in range(PIXELS):
             final[tile, i], last[tile, i] = abs(buf[i]), buf[4 * PIXELS + i]
         for y in range(top, min(top + TILE_HEIGHT, height)):
@@ -200,9 +202,7 @@ def read_tile(grad_rgb, grad_alpha, background, left, top, buf):
 
 
 @numba.njit(fastmath=True, **KERNEL)
-def backward_band(
-    records, entries, start, row_low, background, alpha_max, grad_rgb, grad_alpha, final, last, used, sums, behind
-):
+def backward_band(records, entries, start, row_low, background, grad_rgb, grad_alpha, final, last, used, sums, behind):
     """Adjoint of :func:`forward_band`: writes the band's ``sums`` (rows, SUMS).
 
     ``behind`` (3,), float64 or None, receives the background's loss gradient.
@@ -222,4 +222,4 @@ def backward_band(
             for i in range(PIXELS):
                 for c in range(3):
                     behind[c] += final[tile, i] * buf[(2 + c) * PIXELS + i]
-        backward_tile(records, entries, start[tile], used[tile], left, top, alpha_max, buf, sums)
+        backward_tile(records, entries, start[tile], used[tile], left, top, buf, sums)

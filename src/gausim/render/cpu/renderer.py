@@ -14,7 +14,7 @@ from gausim.kernels.announce import announced
 from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.batch import Batch, Images
-from gausim.render.reference import require_options
+from gausim.render.reference import checked_near
 
 
 class _Render(torch.autograd.Function):
@@ -47,7 +47,7 @@ class _Render(torch.autograd.Function):
         grads = batch.backward(ctx.pool, images, background=needed[4])
         return (
             *(torch.from_numpy(grad) if need else None for grad, need in zip(grads, needed, strict=True)),
-            *[None] * 8,
+            *[None] * 7,
         )
 
 
@@ -58,21 +58,19 @@ class CpuRenderer:
     The first call compiles for some seconds; numba's cache keeps the compiled code.
     """
 
-    def __init__(self, *, threads: int | None = None, near: float = 0.01, alpha_max: float = 0.999) -> None:
+    def __init__(self, *, threads: int | None = None, near: float = 0.01) -> None:
         """Sets the options.
 
         Args:
             threads: worker threads; None means torch.get_num_threads() at the time of each call.
             near: kernels closer than this to the camera plane are dropped [scene units].
-            alpha_max: ceiling of a kernel's opacity at a pixel (gsplat 1.5.3: 0.999).
 
         Raises:
             ConfigError: an option is out of range.
         """
         if threads is not None and threads < 1:
             raise ConfigError(f"render.threads: expected at least 1, got {threads}.")
-        require_options(near, alpha_max)
-        self.threads, self.near, self.alpha_max = threads, near, alpha_max
+        self.threads, self.near = threads, checked_near(near)
 
     def __call__(
         self,
@@ -103,6 +101,5 @@ class CpuRenderer:
         inputs["background"] = behind
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
         pool = shared_pool(self.threads or torch.get_num_threads())
-        options = (*size, self.near, np.float32(self.alpha_max))
         with announced("the CPU renderer"):
-            return Rendered(*_Render.apply(*inputs.values(), pool, keep, viewmats, Ks, *options))
+            return Rendered(*_Render.apply(*inputs.values(), pool, keep, viewmats, Ks, *size, self.near))

@@ -1,6 +1,4 @@
-"""Kernels that are most likely wrong are named with their number, and left out of a clean scene."""
-
-from __future__ import annotations
+"""Scenes with wrong kernels, and the two positions of a state."""
 
 import logging
 from dataclasses import replace
@@ -8,11 +6,22 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.toy_object import toy_scene
 
 from gausim.cli.main import main
 from gausim.core import GaussianScene, SceneError
 from gausim.core.outliers import outliers, without_outliers
+from gausim.core.state import initial_sway
 from gausim.io.ply import load_scene, save_scene
+
+
+def test_sway_grows_from_the_roots() -> None:
+    scene = toy_scene()
+    state = initial_sway(scene, 0.01)
+    shift = (state.positions - state.previous)[:, 0]
+    assert (shift[scene.pinned] == 0).all() and (shift[~scene.pinned] > 0).all()
+    assert float(shift.max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-5)
+    assert torch.equal(state.positions, scene.means)
 
 
 def body(count: int = 60) -> GaussianScene:

@@ -1,19 +1,55 @@
-"""Every operation's fast form against its plain one in float64, values and gradients; which of them serves a call."""
+"""Fast forms against plain ones, and where compiled code is kept."""
 
-from __future__ import annotations
-
+import os
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 import torch
 from torch import Tensor
 
+from gausim.kernels.jit import caching
 from gausim.kernels.operations import OPERATIONS, Operation, plain_forms
 from gausim.losses.image import gaussian_taps, image_loss
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import deformed_appearance
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The temporary folder of the process is another; numba's configuration is as before afterwards."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    yield tmp_path
+    monkeypatch.undo()
+    numba.config.reload_config()
+
+
+def nowhere() -> None:
+    raise RuntimeError("cannot cache function: no locator available")
+
+
+def test_read_only_places_give_a_private_folder(temporary: Path) -> None:
+    assert caching(nowhere)
+    (folder,) = temporary.iterdir()
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder) == numba.config.CACHE_DIR
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+def test_a_folder_that_others_could_write_is_not_trusted(temporary: Path, caplog) -> None:
+    (temporary / f"gausim-numba-{os.getuid()}").mkdir()
+    (temporary / f"gausim-numba-{os.getuid()}").chmod(0o777)
+    assert not caching(nowhere)
+    assert "NUMBA_CACHE_DIR" in caplog.text
+
+
+def test_without_any_place_functions_are_compiled_each_time(monkeypatch, temporary: Path) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/proc/none")
+    assert not caching(nowhere)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
