@@ -19,7 +19,7 @@ ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"
 # The others take a second each; test_configs.py composes and builds all of them.
 QUICK = {"none", "no_mass", "no_momentum", "no_hierarchy", "no_network"}
 TINY = (
-    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "render=reference",
+    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "render=cpu",
     "plan.t_max=3", "plan.batch_size=2", "seed=1", "+loss.explosion=1000",
     "optimizer.decay.network=0",  # what only fades has not learned
 )  # fmt: skip

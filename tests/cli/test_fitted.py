@@ -20,7 +20,7 @@ from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
     "plan.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
-    "render=reference", "trainer.panel_epochs=0", "name=toy", "doctor=false",
+    "render=cpu", "trainer.panel_epochs=0", "name=toy", "doctor=false",
 )  # fmt: skip
 STAGES = "model.plan.stages"
 SMALL: dict[str, list[str]] = {

@@ -27,7 +27,7 @@ RESERVED = "data.test={sequences: [seq_001]}"
 TINY = (
     "model=gausim_paper", LEVELS, "model.simulator.network.layers=1", "model.simulator.network.hidden=8",
     "plan.epochs=1", "plan.repeats=1", "plan.batch_size=2", "plan.t_start=7", "plan.t_max=7",
-    "trainer.progress=false", "trainer.threads=1", "trainer.accelerator=cpu", "render=reference",
+    "trainer.progress=false", "trainer.threads=1", "trainer.accelerator=cpu", "render=cpu",
     "trainer.panel_epochs=1", "trainer.motion_epochs=1", "logger=none", "name=toy", "data=object", RESERVED,
 )  # fmt: skip
 

@@ -110,7 +110,7 @@ def test_parts_and_directions(played) -> None:
 TINY = (
     LEVELS, "model.simulator.template.modes=8", "model.simulator.network.hidden=8", "plan.t_max=3",
     "plan.repeats=1", "plan.batch_size=2", "plan.epochs=4", "trainer.accelerator=cpu", "trainer.progress=false",
-    "trainer.threads=1", "render=reference", "trainer.panel_epochs=0", "logger=none", "name=toy",
+    "trainer.threads=1", "render=cpu", "trainer.panel_epochs=0", "logger=none", "name=toy",
 )  # fmt: skip
 
 

@@ -13,12 +13,12 @@ from helpers.simulators import SMALLEST
 
 TINY = (
     *SMALLEST, "plan.t_start=2", "plan.t_max=2", "plan.repeats=1", "plan.epochs=2",
-    "trainer.accelerator=cpu", "render=reference", "logger=none",
+    "trainer.accelerator=cpu", "render=cpu", "logger=none",
 )  # fmt: skip
 # One of the paper's model, without pictures and dashboards.
 PAPER = (
     *SMALLEST, "model=gausim_paper", "plan.t_start=1", "plan.t_max=2", "plan.repeats=1",
-    "plan.batch_size=2", "plan.epochs=2", "trainer.accelerator=cpu", "render=reference", "logger=none",
+    "plan.batch_size=2", "plan.epochs=2", "trainer.accelerator=cpu", "render=cpu", "logger=none",
     "name=toy",
 )  # fmt: skip
 

@@ -13,8 +13,8 @@ from gausim.core import Cameras, GaussianScene, Trajectory
 from gausim.data.images import write_rgba
 from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
+from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
-from gausim.render.reference import ReferenceRenderer
 from helpers.plain import cameras_at, edit_json, plain_scene
 
 AMPLITUDES = {"seq_000": 0.4, "seq_001": -0.25}
@@ -110,7 +110,7 @@ def _write_sequence(toy: ToyObject, name: str) -> None:
 
 
 def rgba(scene: GaussianScene, trajectory: Trajectory, views: Cameras | None = None) -> Tensor:
-    drawn = draw(ReferenceRenderer(), scene, trajectory.positions, trajectory.deformation_gradients,
+    drawn = draw(CpuRenderer(threads=1), scene, trajectory.positions, trajectory.deformation_gradients,
                  trajectory.rotations, trajectory.unit_of_kernel, views or cameras())  # fmt: skip
     straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
     return (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
