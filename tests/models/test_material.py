@@ -296,7 +296,7 @@ def test_the_network_reads_only_what_the_modes_carry() -> None:
     alone = np.linalg.svd(blocks, compute_uv=False)
     assert step.count == 90 and (alone > 1e-6 * alone[0]).sum() == 18
     silence(model)
-    assert np.abs(step.rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
+    assert np.abs(_LinearStep(model, 0).rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
 
 
 @torch.no_grad()

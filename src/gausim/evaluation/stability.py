@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,20 +51,24 @@ class _LinearStep:
         level = model.batch((scene_id,)).levels[-1]
         self._free = level.free[:, 0].bool()
         self.count = 3 * int(self._free.sum())
+        self._step = cache(self._linearised)  # one graph serves all products
 
-    def _pull(self, weights: Tensor) -> np.ndarray:
-        """weights^T [A, B] for every row of ``weights`` (copies, count)."""
+    def _linearised(self, copies: int) -> tuple[Tensor, Tensor]:
+        """Displacements (2, N, 3) of all units in so many copies of the scene, and the free ones after a step."""
         model = self._model
         with evaluating(model), torch.enable_grad():
-            batch = model.batch((self._scene_id,) * len(weights))
-            prepared = model.prepare(batch)
-            free = self._free.repeat(len(weights))
+            batch = model.batch((self._scene_id,) * copies)
+            prepared, free = model.prepare(batch), self._free.repeat(copies)
             shifts = batch.rest.new_zeros(2, len(free), 3, requires_grad=True)
             kernels = (shifts * free[:, None]).index_select(1, batch.finest)
             state = SimState(batch.rest + kernels[0], batch.rest + kernels[1])
-            after = prepared.mean(model.step(batch, state, prepared=prepared).positions)
-            (pulled,) = torch.autograd.grad((after[free] * weights.view(-1, 3)).sum(), shifts)
-        rows = pulled[:, free].view(2, len(weights), self.count)
+            return shifts, prepared.mean(model.step(batch, state, prepared=prepared).positions)[free]
+
+    def _pull(self, weights: Tensor) -> np.ndarray:
+        """weights^T [A, B] for every row of ``weights`` (copies, count)."""
+        shifts, after = self._step(len(weights))
+        (pulled,) = torch.autograd.grad(after, shifts, weights.view(-1, 3).to(after), retain_graph=True)
+        rows = pulled[:, self._free.repeat(len(weights))].view(2, len(weights), self.count)
         return torch.cat((rows[0], rows[1]), 1).double().cpu().numpy()
 
     def rows(self) -> np.ndarray:
