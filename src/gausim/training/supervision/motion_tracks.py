@@ -8,9 +8,8 @@ coordinates in the model's smooth motions are those whose rendering agrees best 
 
 (for a body in hands relative to its reference, :mod:`gausim.models.reference.held`,)
 found by Levenberg and Marquardt's method on images of falling blur, from an extrapolation of the two frames before; no
-dynamics are assumed. Its matrix J^T J is that of the rest state: the mean of g g^T over loss gradients g = J^T e for
-random images e. The motions phi are scaled to about equal elastic energy, so coordinates that no camera determines stay
-at rest.
+dynamics are assumed. Its matrix J^T J is that of the rest state, by finite differences. The motions phi are scaled to
+about equal elastic energy, so coordinates that no camera determines stay at rest.
 
 Rollouts are compared with the tracked kernels in 3D: every part of the object has the same weight, with little texture
 or much, and nothing is rendered.
@@ -19,7 +18,7 @@ or much, and nothing is rendered.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -27,7 +26,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError, Frame, SmoothMotions
+from gausim.core import Cameras, ConfigError, Frame, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
@@ -38,8 +37,12 @@ from gausim.training.supervision.comparison import channels
 from gausim.training.supervision.images import Appearances, Sources, ViewKeys
 from gausim.training.supervision.points import PointSupervision
 
-# Random images whose loss gradients give the curvature, and how many are drawn at a time.
-PROBES, TOGETHER = 256, 16
+# Displacements of the finite differences that give the curvature [diagonals]; in smaller ones the renderer's cut-off of
+# faint pixels shows.
+DIFFERENCE = 0.01
+# Part of the error that a step has to take away for another one to follow on the same images.
+LEAST_GAIN = 0.01
+TINY = 1e-12
 # Levenberg and Marquardt's damping, in mean eigenvalues of the curvature: its start, and factors after a step that is
 # accepted and after one that is not.
 DAMPING, LESS, MORE = 0.1, 1 / 3, 4.0
@@ -81,7 +84,7 @@ class MotionTracker:
         self._momentum, self._prior = momentum, prior
         self._motions: dict[int, SmoothMotions] = {}
         self._appearances = Appearances(sources.scenes)
-        self._keys, self._curvatures = ViewKeys(), dict[Hashable, Curvature]()
+        self._keys, self._known = ViewKeys(), dict[Hashable, dict[int, Curvature]]()
 
     def motions(self, scene_id: int) -> SmoothMotions:
         """The smooth motions of a scene."""
@@ -113,10 +116,14 @@ class MotionTracker:
     ) -> Float[Tensor, " M"]:
         target = channels(*composite(sample.frames[frame : frame + 1]), self._sources.loss)
         place = guess
-        for factor in self._pyramid:
-            if factor == self._pyramid[-1] or min(target.shape[2:4]) >= LEAST_SIDE * factor:
-                place = self._descend(sample, factor, _shrunk(target, factor), place, carried)
+        for factor in self._factors(sample.cameras):
+            place = self._descend(sample, factor, _shrunk(target, factor), place, carried)
         return place
+
+    def _factors(self, cameras: Cameras) -> list[int]:
+        """The factors by which images of a size are reduced."""
+        side = min(cameras.width, cameras.height)
+        return [f for f in self._pyramid if f == self._pyramid[-1] or side >= LEAST_SIDE * f]
 
     def _descend(
         self,
@@ -127,7 +134,7 @@ class MotionTracker:
         carried: Carried | None,
     ) -> Float[Tensor, " M"]:
         """Steps of Levenberg and Marquardt's method on images reduced by a factor."""
-        curvature = self._curvature(sample, factor)
+        curvature = self._curvatures(sample)[factor]
         unit = float(curvature.values.mean())
         prior, damping = self._prior * unit, DAMPING
 
@@ -141,8 +148,11 @@ class MotionTracker:
         for _ in range(self._iterations):
             tried = place - curvature.step(slope, prior + damping * unit)
             found, steepness = compare(tried)
-            if found < error:
+            gain = float(1 - found / error)
+            if gain > 0:
                 place, error, slope, damping = tried, found, steepness, damping * LESS
+                if gain < LEAST_GAIN:
+                    break
             else:
                 damping *= MORE
         return place
@@ -166,21 +176,34 @@ class MotionTracker:
         )  # fmt: skip
         return channels(drawn.rgb, drawn.alpha, self._sources.loss)
 
-    def _curvature(self, sample: SequenceSample, factor: int) -> Curvature:
-        """Curvature of a scene's images in the sample's cameras, reduced by a factor; computed once."""
-        key = self._keys.of(sample), factor
-        if key not in self._curvatures:
-            draws, like = torch.Generator().manual_seed(0), self.motions(sample.scene_id).kernels
-            slopes = []
-            for _ in range(0, PROBES, TOGETHER):
-                places = like.new_zeros(TOGETHER, self.motions(sample.scene_id).count).to(sample.frames.device)
-                images = _shrunk(self._drawn(sample, places.requires_grad_()), factor)
-                weights = torch.randn(images.shape, generator=draws).to(images)
-                slopes.append(torch.autograd.grad(images, places, weights)[0])
-            slope = torch.cat(slopes)
-            values, vectors = torch.linalg.eigh(slope.mT @ slope / len(slope))
-            self._curvatures[key] = Curvature(values.clamp_min(0), vectors)
-        return self._curvatures[key]
+    @torch.no_grad()
+    def _curvatures(self, sample: SequenceSample) -> dict[int, Curvature]:
+        """Curvature of a scene's images in the sample's cameras, reduced by every factor; computed once."""
+        key = self._keys.of(sample)
+        if key not in self._known:
+            motions, factors = self.motions(sample.scene_id), self._factors(sample.cameras)
+            sizes = (
+                DIFFERENCE
+                * self._sources.scenes[sample.scene_id].diagonal
+                / motions.kernels.norm(dim=1).amax(0).clamp_min(TINY)
+            )
+            sums = torch.zeros(len(factors), motions.count, motions.count, device=sample.frames.device)
+            for view in range(len(sample.cameras.names)):  # one after another, for less memory
+                own = replace(sample, cameras=sample.cameras.select([view]))
+                slopes = self._slopes(own, sizes.to(sums))
+                for number, factor in enumerate(factors):
+                    small = _shrunk(slopes, factor).flatten(1)
+                    sums[number] += small @ small.mT
+            values, vectors = torch.linalg.eigh(sums)
+            self._known[key] = {
+                factor: Curvature(*own) for factor, *own in zip(factors, values.clamp_min(0), vectors, strict=True)
+            }
+        return self._known[key]
+
+    def _slopes(self, sample: SequenceSample, sizes: Float[Tensor, " M"]) -> Float[Tensor, "M V H W C"]:
+        """Derivatives of the images at rest with respect to the coordinates, by central differences."""
+        ends = [torch.cat([self._drawn(sample, row[None]) for row in torch.diag(sign * sizes)]) for sign in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * sizes.view(-1, 1, 1, 1, 1))
 
 
 class TrackSupervision(PointSupervision):
