@@ -32,6 +32,19 @@ def test_the_step_solves_its_equation(law: str) -> None:
 
 @LAWS
 @torch.no_grad()
+def test_a_step_like_another_is_solved_without_stiffness(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    part = neural_model(law=law).modal_scene(0)
+    part.corrections = 8
+    z, previous = 0.01 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    known, near, true = part.solve(z, previous), (1.05 * z, previous), part.after(1.05 * z, previous)
+    monkeypatch.delattr(type(part.nonlinear), "stiffening")
+    step = part.solve(*near, inverse=known.inverse)
+    torch.testing.assert_close(step.after, true, rtol=1e-3, atol=1e-3 * float(true.abs().max()))
+    assert float(step.change.norm()) < 1e-3 * float(true.norm()) and torch.equal(step.inverse, known.inverse)
+
+
+@LAWS
+@torch.no_grad()
 def test_resistance_to_growth_takes_the_energy_that_is_lost_and_none_from_a_rotation(law: str) -> None:
     template = partial(NEURAL["template"], solid=SolidSettings(0.12, 0.0), links=Links(12, damping=0.1), hidden=48)
     part = neural_model(law=law, template=template).modal_scene(0)

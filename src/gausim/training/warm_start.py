@@ -27,6 +27,9 @@ from gausim.training.optimizers import OptimizerSettings
 from gausim.training.plan import USUAL, WarmStart
 from gausim.training.tracking import Track
 
+# Updates of the fit with the same sequences: steps that are alike take less time.
+KEPT = 10
+
 
 def warm_start(learner: Learner, tracks: Sequence[Track], settings: WarmStart, *, quiet: bool = False) -> None:
     """Fits initial states and material to tracked motion (:func:`gausim.training.tracking.track`).
@@ -71,8 +74,13 @@ def _known(
     loads = [torch.stack([cast(Tensor, units.load) for _, units in own]) for own in found if own is not None]
     load = torch.stack(loads, 1) if loads else None
 
+    rows, calls = list(range(len(numbers))), 0
+
     def known(steps: int) -> KnownMotion:
-        rows = torch.randperm(len(numbers), generator=draws)[:most].tolist()
+        nonlocal rows, calls
+        if len(numbers) > most and calls % KEPT == 0:
+            rows = torch.randperm(len(numbers), generator=draws)[:most].tolist()
+        calls += 1
         motion = torch.stack([states.motion(numbers[i]) for i in rows])
         before, after = -motion.flatten(1) @ projection, z[rows, 1 : steps + 1].movedim(1, 0)
         own = None if load is None else load[:steps, rows]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -34,6 +34,14 @@ class NonlinearForce(Protocol):
 
     def dissipated(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float) -> Tensor:
         """Energy (S,) that the damping takes."""
+
+
+class Solved(NamedTuple):
+    """A solved step."""
+
+    after: Float[Tensor, "S M"]  # z_{t+1}
+    inverse: Float[Tensor, "S M M"]  # with which the corrections were computed, the last one at least
+    change: Float[Tensor, "S M"]  # by the last correction
 
 
 class ModalScene:
@@ -95,8 +103,20 @@ class ModalScene:
 
             M (z_{t+1} - 2 z_t + z_{t-1}) = f(m_-, m_+) - K (m_- + m_+) / 2 - D (z_{t+1} - z_{t-1}) / 2 + load
 
-        Resistance to growth is part of f. Without damping and load a step conserves :meth:`energy` exactly. It is
-        solved by corrections; loss gradients are theirs.
+        Resistance to growth is part of f. Without damping and load a step conserves :meth:`energy` exactly.
+        """
+        return self.solve(z, previous, load).after
+
+    def solve(
+        self,
+        z: Float[Tensor, "S M"],
+        previous: Float[Tensor, "S M"],
+        load: Float[Tensor, "S N 12"] | None = None,
+        inverse: Float[Tensor, "S M M"] | None = None,
+    ) -> Solved:
+        """The step of :meth:`after`, solved by corrections; loss gradients are theirs.
+
+        ``inverse`` is that of nearly the same step. With it no stiffness is computed, which takes most of the time.
         """
         law, factor, damping = self.nonlinear, self.factor, self.growth
         speed, bend = z - previous, torch.zeros_like(z)
@@ -104,17 +124,19 @@ class ModalScene:
         if load is not None:
             reference, force = law.reference_strain(load[..., 3:]), force + self.force(load)
         linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first, now = law.strain_state(z - speed / 2, reference), law.strain_state(z, reference)
+        first = law.strain_state(z - speed / 2, reference)
+        given, used = inverse is not None, z.new_zeros(0) if inverse is None else inverse
         for correction in range(self.corrections):
             second = law.strain_state(z + (speed + bend) / 2, reference)
-            if correction < self.corrections - 1:
+            if correction < self.corrections - 1 and not given:
                 with torch.no_grad():
-                    ends = (first, second) if correction else (now, now)
+                    ends = (first, second) if correction else 2 * (law.strain_state(z, reference),)
                     operator = linear + law.stiffening(*ends, factor, damping) / 4
-                    inverse = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
+                    used = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
             nonlinear = law.between(first, second, factor, damping)
-            bend = bend + (inverse @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
-        return z + speed + bend
+            change = (used @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
+            bend = bend + change
+        return Solved(z + speed + bend, used, change.detach())
 
     def overshoot(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """The part of a displacement by an impulse that its frame does not reach.
