@@ -20,6 +20,7 @@ CASES = {
     "render": "the CPU renderer against plain torch, threads, views, compilation",
     "step": "one predicted frame at the paper's size, with and without hierarchy, and of the other models",
     "train": "whole optimiser steps, part by part; KEY=VALUE as in `gausim train`",
+    "teach": "single steps and rollouts of the pure network on tracked motion: pairs per second",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed: simulated frames per second, from the force to the browser's bytes",
     "cluster": "clusters of bounded diameter, against scipy",

@@ -10,7 +10,7 @@ import torch
 from helpers import toy_object
 from helpers.simulators import gausim
 
-from benchmarks import cluster, data, interact, render, step, train
+from benchmarks import cluster, data, interact, render, step, teach, train
 from benchmarks.harness import Options, peak_saved_bytes
 from gausim.core import GaussianScene
 from gausim.data.datamodule import ReadyDataModule
@@ -80,3 +80,9 @@ def test_peak_counts_what_is_held_at_one_time() -> None:
     assert peak_saved_bytes(in_turn) == 4000  # the result of exp, once
     assert peak_saved_bytes(lambda: (x.exp().sum() + x.sin().exp().sum()).backward()) == 3 * 4000
     assert peak_saved_bytes(lambda: (x * x).sum()) == 4000  # x twice, the same storage
+
+
+def test_teaching_is_measured_in_pairs() -> None:
+    rows = {row.metric: row for row in teach.run(QUICK)}
+    assert {(row.unit, row.value > 0) for row in rows.values()} == {("pairs/s", True), ("frames/s", True)}
+    assert next(iter(rows.values())).case.startswith("teach, 120 kernels, ")

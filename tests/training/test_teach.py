@@ -35,8 +35,7 @@ def test_a_network_that_is_taught_an_oscillator_has_learned_its_flow(toy: Path) 
     options = ["supervision=points", "optimizer.network_lr=4e-3", "model.simulator.network.hidden=16"]
     module, data = build(compose([f"data.root={toy}", *QUICK, *options, "plan.teach.shows=40", "plan.teach.rolls=4"]))
     whole = [  # all frames, of which the first 16 are seen
-        Track(data.training_sample(number, 15), data.index.ground_truth(number).positions - module.scenes[0].means)
-        for number in range(2)
+        Track(0, number, data.index.ground_truth(number).positions - module.scenes[0].means) for number in range(2)
     ]
 
     def left() -> float:

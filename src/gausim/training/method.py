@@ -57,9 +57,8 @@ class SharedSimulator:
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
         """x_0 and x_{-1} of the sequences of a batch."""
         states = [self.state(s.sequence_id, s.start) for s in samples]
-        return SimState(
-            *(torch.cat(x).to(batch.rest) for x in zip(*((s.positions, s.previous) for s in states), strict=True))
-        )
+        now, before = torch.cat([s.positions for s in states]), torch.cat([s.previous for s in states])
+        return SimState(now.to(batch.rest), before.to(batch.rest))
 
     def state(self, sequence_id: int, start: int = 0) -> SimState:
         """The state at which rollouts of a sequence begin; ``start`` is 0 where states of later frames are unknown."""

@@ -51,9 +51,9 @@ class Lesson:
     def __init__(self, learner: Learner, model: GausSim, tracks: Sequence[Track], noise: float, seed: int) -> None:
         """Stores the tracked positions; ``noise`` is that of :class:`Teaching`."""
         self._learner, self._model, self._noise = learner, model, noise
-        self._scenes = [known.sample.scene_id for known in tracks]
-        self._numbers = [known.sample.sequence_id for known in tracks]
-        self._positions = [model.scenes[known.sample.scene_id].means.to(known.moved) + known.moved for known in tracks]
+        self._scenes = [known.scene_id for known in tracks]
+        self._numbers = [known.sequence_id for known in tracks]
+        self._positions = [model.scenes[known.scene_id].means.to(known.moved) + known.moved for known in tracks]
         self.last = min(len(positions) for positions in self._positions) - 1
         self.draws = torch.Generator().manual_seed(hash_seed(seed, TEACHING))
 
@@ -146,11 +146,11 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
     first = {name: own for name, own in groups.items() if name == "network" or (name == "scene" and not fitted)}
     with torch.enable_grad(), gathering_nothing(normalisers):
         if settings.shows:
-            left = _descend(learner, lesson, first, _pairs(lesson, settings), 1.0, "Teaching single steps", quiet)
+            left = descend(learner, lesson, first, _pairs(lesson, settings), 1.0, "Teaching single steps", quiet)
             print(f"  teach: of the motion between two frames, single steps leave {left:.3f}", flush=True)
         if settings.rolls:
             rate = settings.roll_factor
-            left = _descend(learner, lesson, groups, _rolls(lesson, settings), rate, "Teaching rollouts", quiet)
+            left = descend(learner, lesson, groups, _rolls(lesson, settings), rate, "Teaching rollouts", quiet)
             print(f"  roll: rollouts on the tracks leave {left:.3f} of the motion", flush=True)
 
 
@@ -174,7 +174,7 @@ def _rolls(lesson: Lesson, settings: Teaching) -> list[Update]:
     return found
 
 
-def _descend(
+def descend(
     learner: Learner,
     lesson: Lesson,
     groups: dict[str, list[Parameter]],

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.dataset import SequenceSample
 from gausim.data.records import GroundTruth
 from gausim.models.step.simulator import GausSim
 from gausim.runs.bar import with_bar
@@ -25,7 +24,8 @@ from gausim.training.supervision.points import PointSupervision, attach_points
 class Track:
     """The motion of one sequence in its seen frames."""
 
-    sample: SequenceSample
+    scene_id: int  # index of the object
+    sequence_id: int  # number of the sequence over all objects
     moved: Float[Tensor, "F K 3"]  # displacements of all kernels from rest, frame 0 first [scene units]
 
 
@@ -44,7 +44,7 @@ def track(learner: Learner, data: ReadyDataModule, *, quiet: bool = False) -> li
     found = []
     for number in with_bar(range(len(data.index.entries)), "Tracking the motion", quiet=quiet):
         sample = data.training_sample(number, last).to(device)
-        found.append(Track(sample, tracks.displacements(sample).to(device)))
+        found.append(Track(sample.scene_id, number, tracks.displacements(sample).to(device)))
         states.set_motion(number, found[-1].moved[1])
     print(f"  track: {_told(learner, data, found)}", flush=True)
     return found
@@ -54,7 +54,7 @@ def _told(learner: Learner, data: ReadyDataModule, tracks: Sequence[Track]) -> s
     """How many sequences were tracked and, of those whose true motion is known, the error."""
     errors = []
     for known in tracks:
-        number = known.sample.sequence_id
+        number = known.sequence_id
         sealed = data.index.entries[number][1].limit is not None
         truth = None if sealed else data.index.ground_truth(number)
         if truth is not None and learner.method.hands(number) is None:
@@ -68,7 +68,7 @@ def _told(learner: Learner, data: ReadyDataModule, tracks: Sequence[Track]) -> s
 
 def track_error(learner: Learner, known: Track, truth: GroundTruth) -> float:
     """Mean error of a track's points over their mean displacement, in the frames after the first."""
-    scene = learner.simulator.scenes[known.sample.scene_id]
+    scene = learner.simulator.scenes[known.scene_id]
     kernels = attach_points(scene, truth.rest)
     true = (truth.positions[1 : len(known.moved)] - truth.rest).to(known.moved)
     off = known.moved[1:, kernels.to(known.moved.device)] - true

@@ -43,7 +43,7 @@ def warm_start(learner: Learner, tracks: Sequence[Track], settings: WarmStart, *
     groups = {name: own for name, own in learner.groups().items() if name != "network"}
     scenes: dict[int, list[Track]] = {}
     for known in tracks:
-        scenes.setdefault(known.sample.scene_id, []).append(known)
+        scenes.setdefault(known.scene_id, []).append(known)
     motions = [(i, _known(learner, states, i, own, settings.sequences)) for i, own in scenes.items()]
     last = len(tracks[0].moved) - 1
     updates = math.ceil(settings.updates * min(1.0, USUAL / last))
@@ -66,7 +66,7 @@ def _known(
     learner: Learner, states: InitialStates, scene_id: int, tracked: Sequence[Track], most: int
 ) -> Callable[[int], KnownMotion]:
     """T frames of some of the sequences of a scene as they were tracked, from their trained initial states."""
-    draws, numbers = torch.Generator().manual_seed(0), [known.sample.sequence_id for known in tracked]
+    draws, numbers = torch.Generator().manual_seed(0), [known.sequence_id for known in tracked]
     projection = cast(GausSim, learner.model).modal_projection(scene_id).flatten(0, 1)
     z = torch.stack([known.moved.flatten(1) @ projection for known in tracked])
     size = modal_fit.size_of(z[:, 1:])

@@ -45,9 +45,8 @@ def energy_growth(
     """
     low, high = math.log(SMALLEST), math.log(LARGEST)
     size = math.exp(low + (high - low) * float(torch.rand((), generator=draws)))
-    state = SimState(
-        *(batch.rest + size * (x - batch.rest) for x in (state.positions.detach(), state.previous.detach()))
-    )
+    now, before = (batch.rest + size * (x.detach() - batch.rest) for x in (state.positions, state.previous))
+    state = SimState(now, before)
     with torch.no_grad():
         ((_, made),) = graphs.windows(batch, state, stretch, stretch, isolated=True)
         before = _mean_energy(model, batch, state, made)
