@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 EPILOG = """The result is a run of its own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the
 state before frame 0 of each sequence, nothing else: network, densities, attributes and template stay bit by bit.
-Only frames 0 .. FRAMES - 1 of the training views are looked at.
+Only frames 0 .. FRAMES - 1 of the training views are read.
 
   gausim adapt outputs/bunny/seed_0 --sequences seq_009 seq_010 seq_011
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3

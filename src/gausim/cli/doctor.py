@@ -62,7 +62,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     if faults:
         if not arguments.json:
             count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
-            print(f"{root}: {count} in its files; nothing else was looked at")
+            print(f"{root}: {count} in its files; nothing else was checked")
             print("\n".join(f"  {fault.where}: {fault.what}" for fault in faults))
         return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
     data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)

@@ -136,7 +136,7 @@ class ReadyDataModule(LightningDataModule):
             if sealed:
                 lines.append(
                     f"{item.name}: {', '.join(sealed)} are of the test part: only images of frames 0.."
-                    f"{item.train_frames.stop - 1} are looked at, and their motion is not watched"
+                    f"{item.train_frames.stop - 1} are read, and their motion is not checked"
                 )
         return lines
 

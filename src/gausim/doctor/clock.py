@@ -46,7 +46,7 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
         return
     if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
         yield Finding(
-            "note", "Whether the cameras are in step was not looked at: their poses are wrong.",
+            "note", "Whether the cameras are in step was not checked: their poses are wrong.",
             "Mend the calibration and run this again.",
         )  # fmt: skip
         return
@@ -165,7 +165,7 @@ def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[
 
 
 def _findings(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Iterator[Finding]:
-    place = f"in {sequences[0]}" if len(sequences) == 1 else f"in all {len(sequences)} sequences that were looked at"
+    place = f"in {sequences[0]}" if len(sequences) == 1 else f"in all {len(sequences)} checked sequences"
     for v, lag in lags.items():
         if lag == 0:
             continue

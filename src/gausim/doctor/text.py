@@ -22,7 +22,7 @@ def findings_text(root: str, found: Examination) -> str:
                                break_long_words=False, break_on_hyphens=False)  # fmt: skip
     for cause in dict.fromkeys(found.left_out.values()):
         names = listed([name for name, other in found.left_out.items() if other == cause])
-        lines.append(f"  Not looked at until the fault of '{cause}' is mended: {names}.")
+        lines.append(f"  Not checked until the fault of '{cause}' is mended: {names}.")
     return "\n".join(lines)
 
 
@@ -37,7 +37,7 @@ def summary_line(found: Examination) -> str:
         return f"{told}."
     frames = max(len(item.alpha) for item in evidence.watched)
     return (
-        f"{told} ({len(evidence.views)} cameras, {evidence.sequences} sequences; looked at frames 0 to {frames - 1} of "
+        f"{told} ({len(evidence.views)} cameras, {evidence.sequences} sequences; checked frames 0 to {frames - 1} of "
         f"{len(evidence.watched)} and frame 0 of {len(evidence.first)})."
     )
 
