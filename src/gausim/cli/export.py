@@ -46,6 +46,8 @@ def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     computing(arguments)
+    if arguments.format == "page":
+        return _page(arguments)
     motion = _thinned(_opened(arguments), arguments.every)
     path = arguments.out or Path(f"{motion.name}{FORMATS[arguments.format].suffix}")
     count = _write(motion, path, arguments)
@@ -70,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--fps", type=float, help="play a folder of PLY files so fast [frames / s] (default: as it says)")
     add("--up", default="z", choices=("y", "z"), help="point the vertical axis so (default: z)")
     add_device_options(parser)
-    pictures = parser.add_argument_group("mp4, gif and html")
+    pictures = parser.add_argument_group("mp4, gif, html and page")
     add_names(pictures, "cameras", "look from this camera of the run's data set (default: --azimuth)", several=False)
     pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="look from this side "
                           "(default: 30)")  # fmt: skip
@@ -79,6 +81,29 @@ def _parser() -> argparse.ArgumentParser:
     pictures.add_argument("--background", default="black", metavar="COLOR", help="draw on black, white or R,G,B in "
                           "0..1 (default: black)")  # fmt: skip
     return parser
+
+
+def _page(arguments: argparse.Namespace) -> int:
+    """Writes the page that simulates an object."""
+    from gausim.compose.build import load_run
+    from gausim.compose.data_paths import data_option
+    from gausim.compose.page import elastic_page
+    from gausim.compose.predict import run_objects, scene_of, state_of
+    from gausim.io.page import save_page
+
+    run = load_run(arguments.source, data=data_option(arguments.data), device="cpu")
+    state_of(run)
+    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
+    page, share = elastic_page(run, item)
+    path = arguments.out or Path(f"{item.data.name}.html")
+    motion = Motion(
+        item.data.name, page.fps, 0, lambda: iter(()), scene_of(run, item), cameras=item.data.sequences[0].cameras
+    )
+    background = parse_background(arguments.background)
+    sizes = save_page(path, page, _camera(motion, arguments), up=arguments.up, background=background)
+    parts = ", ".join(f"{name} {size / 1e6:.2f}" for name, size in sizes.items())
+    print(f"wrote {path}: {page.scene.count} kernels, {len(page.centres)} units; MB: {parts}\n{share}")
+    return 0
 
 
 def _opened(arguments: argparse.Namespace) -> Motion:
@@ -230,6 +255,7 @@ FORMATS = {
     "ply": Format("", "a 3DGS PLY per frame, with turned spherical harmonics and masks", "units and their deformation"),
     "motion": Format(".motion.glb", "rest scene, and 12 half floats per unit and frame", "digits beyond a thousandth"),
     "html": Format(".html", "as motion, in one page that plays in a browser without a network", "as motion"),
+    "page": Format(".html", "the learned template, to be pulled in a browser without a network", "the network"),
     "gltf": Format("", "a GLB per frame (KHR_gaussian_splatting)", "masks, units, frame rate"),
     "usd": Format(".usdc", "a ParticleField3DGaussianSplat with time samples", "masks, units"),
     "mp4": Format(".mp4", "pictures of one camera", "everything else"),

@@ -80,24 +80,29 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
     if not np.isfinite(units).all():
         raise DataError(f"{scene.name}: the motion is beyond half floats (65504). Export it as ply or safetensors.")
     masks = sum(getattr(scene, name).cpu().int() << bit for bit, name in enumerate(_MASKS))
-    high = scene.sh[:, 1:].detach().cpu().float()
-    scales = high.abs().amax((0, 2)) / _LEVELS
-    levels = (high / scales.clamp_min(1e-30)[:, None]).round()
+    levels, scales = quantised_harmonics(scene)
     views = {
         "rest_centres": motion.rest_centres.numpy().astype("<f4"),
         "origins": origins.numpy().astype("<f4"),
         "units": units,
         "unit_of_kernel": motion.unit_of_kernel.numpy().astype("<u2" if count <= 1 << 16 else "<u4"),
         "masks": np.asarray(masks, np.uint8),
-        "sh": levels.numpy().astype(np.int8),
+        "sh": levels,
     }
     facts = {
         "version": VERSION, "fps": trajectory.fps, "frames": trajectory.frames, "units": count,
-        "diagonal": scene.diagonal, "volume_scale": scene.volume_scale, "sh_scales": scales.tolist(),
+        "diagonal": scene.diagonal, "volume_scale": scene.volume_scale, "sh_scales": scales,
     }  # fmt: skip
     indices = {name: glb.add_view(array) for name, array in views.items()}
     glb.document["extras"] = {KEY: {**facts, "views": indices}}
     return glb
+
+
+def quantised_harmonics(scene: GaussianScene) -> tuple[np.ndarray, list[float]]:
+    """Coefficients above degree 0 as bytes (K, C, 3), and the value of one step of each of the C."""
+    high = scene.sh[:, 1:].detach().cpu().float()
+    scales = high.abs().amax((0, 2)) / _LEVELS
+    return (high / scales.clamp_min(1e-30)[:, None]).round().numpy().astype(np.int8), scales.tolist()
 
 
 def save_motion(path: Path | str, scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> None:

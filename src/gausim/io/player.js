@@ -1,9 +1,4 @@
-// Plays a motion of Gaussians: x_k = x_c + G_c (X_k - X_c), covariance G S G^T, colours looked up at Q^T d.
-// Every frame, a first pass projects each Gaussian once into textures; a second draws them as quads from back to front.
-"use strict";
-
-const SHIFT = 11, WIDTH = 1 << SHIFT; // of all textures that are lists [texels]
-const content = (id) => document.getElementById(id).textContent;
+// Plays a motion of Gaussians that is stored frame by frame (splats.js draws them).
 
 // ---- The file -------------------------------------------------------------------------------------------------------
 
@@ -28,11 +23,6 @@ function readMotion(base64) {
   };
 }
 
-const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
-  const exponent = (bits >> 10) & 31, digits = bits & 1023, sign = bits >> 15 ? -1 : 1;
-  return sign * (exponent ? 2 ** (exponent - 25) * (1024 + digits) : 2 ** -24 * digits);
-});
-
 // ---- The motion -----------------------------------------------------------------------------------------------------
 
 // Centre, G and Q of every unit at a time between two frames, 24 floats: rows of G with the centre beside, rows of Q.
@@ -52,224 +42,6 @@ function unitsAt(motion, time, out) {
     rotationOf(out, 24 * u);
   }
   return out;
-}
-
-// The rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2; the last where G has no inverse.
-function rotationOf(m, at) {
-  let r = [m[at], m[at + 1], m[at + 2], m[at + 4], m[at + 5], m[at + 6], m[at + 8], m[at + 9], m[at + 10]];
-  for (let step = 0; step < 8; step++) {
-    const [a, b, c, d, e, f, g, h, i] = r;
-    const cofactors = [e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h,
-      b * f - c * e, c * d - a * f, a * e - b * d];
-    const det = a * cofactors[0] + b * cofactors[1] + c * cofactors[2];
-    if (Math.abs(det) < 1e-12) break;
-    r = r.map((value, k) => 0.5 * (value + cofactors[k] / det));
-  }
-  for (let k = 0; k < 9; k++) m[at + 12 + 4 * Math.floor(k / 3) + (k % 3)] = r[k];
-}
-
-// Offsets from the centre with the unit, covariances with the opacity, base colours: four floats in each of four lists.
-function restLists(motion) {
-  const count = motion.unitOf.length, lists = [0, 1, 2, 3].map(() => new Float32Array(4 * count));
-  for (let k = 0; k < count; k++) {
-    const unit = motion.unitOf[k], [x, y, z, w] = motion.rotations.subarray(4 * k, 4 * k + 4);
-    const s = motion.scales.subarray(3 * k, 3 * k + 3);
-    const rows = [
-      [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-      [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-      [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ].map((row) => row.map((value, j) => value * s[j]));
-    const covariance = (i, j) => rows[i].reduce((sum, value, n) => sum + value * rows[j][n], 0);
-    for (let i = 0; i < 3; i++) lists[0][4 * k + i] = motion.rest[3 * k + i] - motion.restCentres[3 * unit + i];
-    lists[0][4 * k + 3] = unit;
-    lists[1].set([covariance(0, 0), covariance(0, 1), covariance(0, 2), motion.opacities[k]], 4 * k);
-    lists[2].set([covariance(1, 1), covariance(1, 2), covariance(2, 2), 0], 4 * k);
-    lists[3].set(motion.base.subarray(3 * k, 3 * k + 3), 4 * k);
-  }
-  return lists;
-}
-
-// Orders the Gaussians from back to front by counting their depths in 65536 steps.
-class Order {
-  constructor(motion, offsets) {
-    this.motion = motion; this.offsets = offsets;
-    this.depths = new Float32Array(motion.unitOf.length);
-    this.keys = new Uint16Array(motion.unitOf.length);
-    this.indices = new Uint32Array(WIDTH * Math.ceil(motion.unitOf.length / WIDTH)); // whole rows of a texture
-    this.rows = new Float32Array(4 * motion.units);
-  }
-  sort(units, view) {
-    const { rows, depths, keys, offsets } = this, count = depths.length, [x, y, z, w] = view.slice(8, 12);
-    for (let u = 0; u < this.motion.units; u++) {
-      const m = 24 * u;
-      for (let j = 0; j < 4; j++) rows[4 * u + j] = x * units[m + j] + y * units[m + 4 + j] + z * units[m + 8 + j];
-      rows[4 * u + 3] += w;
-    }
-    let low = Infinity, high = -Infinity;
-    for (let k = 0; k < count; k++) {
-      const r = 4 * this.motion.unitOf[k], o = 4 * k;
-      const depth = rows[r] * offsets[o] + rows[r + 1] * offsets[o + 1] + rows[r + 2] * offsets[o + 2] + rows[r + 3];
-      depths[k] = depth; low = Math.min(low, depth); high = Math.max(high, depth);
-    }
-    const starts = new Uint32Array(65537), scale = 65535 / Math.max(high - low, 1e-12);
-    for (let k = 0; k < count; k++) { keys[k] = (high - depths[k]) * scale; starts[keys[k] + 1]++; }
-    for (let i = 0; i < 65536; i++) starts[i + 1] += starts[i];
-    for (let k = 0; k < count; k++) this.indices[starts[keys[k]]++] = k;
-    return this.indices;
-  }
-}
-
-// ---- The pictures ---------------------------------------------------------------------------------------------------
-
-class Painter {
-  constructor(canvas, motion, lists, background) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
-    if (!gl || !gl.getExtension("EXT_color_buffer_float")) {
-      throw new Error("This browser cannot draw: WebGL 2 with EXT_color_buffer_float is needed.");
-    }
-    const count = motion.unitOf.length, rows = (n) => Math.ceil(n / WIDTH), above = motion.sh_scales.length;
-    if (rows(count * Math.max(above, 1)) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
-      throw new Error(`${count} Gaussians do not fit into this machine's textures.`);
-    }
-    Object.assign(this, { gl, canvas, count, rows: rows(count), background });
-    this.project = program(gl, "whole", "project");
-    this.quads = program(gl, "quads", "blend");
-    this.lists = lists.map((list) => texture(gl, list, this.rows));
-    const higher = padded(motion.sh, above * count);
-    this.harmonics = texture(gl, higher, Math.max(rows(above * count), 1), gl.RGBA8_SNORM, gl.BYTE);
-    this.units = texture(gl, null, rows(6 * motion.units));
-    this.unitRows = rows(6 * motion.units);
-    this.made = [0, 1, 2].map(() => texture(gl, null, this.rows));
-    this.target = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    this.made.forEach((made, i) =>
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, made, 0));
-    gl.drawBuffers([0, 1, 2].map((i) => gl.COLOR_ATTACHMENT0 + i));
-    this.order = texture(gl, null, this.rows, gl.R32UI);
-    // One draw call of all quads: instances of four corners are slow where GL is computed by software.
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const corner = (i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6];
-    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => corner(i));
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    gl.useProgram(this.project);
-    const scales = Float32Array.from({ length: 15 }, (_, i) => 127 * (motion.sh_scales[i] || 0)); // of values in -1..1
-    gl.uniform1fv(gl.getUniformLocation(this.project, "scales"), scales);
-    gl.uniform1i(gl.getUniformLocation(this.project, "count"), count);
-    gl.uniform1i(gl.getUniformLocation(this.project, "coefficients"), above);
-  }
-
-  draw(units, indices, camera) {
-    const { gl } = this, { width, height } = this.canvas, size = [camera.focal, width, height];
-    gl.bindTexture(gl.TEXTURE_2D, this.units);
-    const list = new Float32Array(4 * WIDTH * this.unitRows);
-    list.set(units);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.unitRows, gl.RGBA, gl.FLOAT, list);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.viewport(0, 0, WIDTH, this.rows);
-    gl.disable(gl.BLEND);
-    const names = ["offsets", "covariances", "corners", "bases", "harmonics", "units", "order"];
-    this.use(this.project, names, [...this.lists, this.harmonics, this.units, this.order], size);
-    // Into `order`, which is the texture that was bound last.
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, indices);
-    gl.uniformMatrix4fv(gl.getUniformLocation(this.project, "view"), true, camera.view);
-    gl.uniform3fv(gl.getUniformLocation(this.project, "eye"), camera.eye);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
-    gl.clearColor(...this.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    this.use(this.quads, ["places", "ellipses", "colors"], this.made, size);
-    gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
-  }
-
-  use(made, names, textures, size) {
-    const { gl } = this;
-    gl.useProgram(made);
-    names.forEach((name, i) => {
-      gl.activeTexture(gl.TEXTURE0 + i);
-      gl.bindTexture(gl.TEXTURE_2D, textures[i]);
-      gl.uniform1i(gl.getUniformLocation(made, name), i);
-    });
-    gl.uniform3fv(gl.getUniformLocation(made, "camera"), size);
-  }
-}
-
-function texture(gl, list, rows, format = gl.RGBA32F, type = gl.FLOAT) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, format, WIDTH, rows);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  if (list) {
-    const whole = new list.constructor(4 * WIDTH * rows);
-    whole.set(list);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, gl.RGBA, type, whole);
-  }
-  return made;
-}
-
-function padded(triples, count) {
-  const out = new Int8Array(4 * count);
-  for (let i = 0; i < count; i++) for (let j = 0; j < 3; j++) out[4 * i + j] = triples[3 * i + j];
-  return out;
-}
-
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    const sizes = `#version 300 es\n#define WIDTH ${WIDTH}\n#define SHIFT ${SHIFT}\n`;
-    gl.shaderSource(shader, sizes + content("common") + content(text));
-    gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
-  return made;
-}
-
-// ---- The camera -----------------------------------------------------------------------------------------------------
-
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const plus = (a, b, scale = 1) => a.map((value, i) => value + scale * b[i]);
-const unit = (a) => a.map((value) => value / Math.hypot(...a));
-
-// Turns about a target; `up` stays vertical on the screen.
-class Orbit {
-  constructor(home) { this.home = home; this.reset(); }
-  reset() { this.look(this.home); }
-  look({ eye, target, up, fov }) {
-    Object.assign(this, { target: [...target], up: unit(up), fov });
-    const back = plus(eye, target, -1);
-    this.distance = Math.hypot(...back);
-    this.pitch = Math.asin(Math.max(-1, Math.min(1, dot(back, this.up) / this.distance)));
-    const flat = plus(back, this.up, -dot(back, this.up));
-    const [x, y, z] = this.up;
-    this.front = unit(Math.hypot(...flat) > 1e-9 * this.distance ? flat : cross(this.up, [y, z, -x]));
-    this.side = cross(this.up, this.front);
-    this.yaw = 0;
-  }
-  turn(dx, dy) {
-    this.yaw -= dx;
-    this.pitch = Math.max(-1.55, Math.min(1.55, this.pitch + dy));
-  }
-  pan(dx, dy, height) {
-    const { view } = this.camera(1, height), scale = (2 * this.distance * Math.tan(this.fov / 2)) / height;
-    this.target = plus(plus(this.target, view.slice(0, 3), -dx * scale), view.slice(4, 7), -dy * scale);
-  }
-  zoom(factor) { this.distance *= factor; }
-  camera(width, height) {
-    const flat = plus(this.front.map((v) => v * Math.cos(this.yaw)), this.side, Math.sin(this.yaw));
-    const back = plus(flat.map((v) => v * Math.cos(this.pitch)), this.up, Math.sin(this.pitch));
-    const eye = plus(this.target, back, this.distance), forward = back.map((v) => -v);
-    const right = unit(cross(forward, this.up)), down = cross(forward, right);
-    const rows = [right, down, forward].map((row) => [...row, -dot(row, eye)]);
-    return { eye, view: [...rows.flat(), 0, 0, 0, 1], focal: Math.min(width, height) / (2 * Math.tan(this.fov / 2)) };
-  }
 }
 
 // ---- The page -------------------------------------------------------------------------------------------------------
@@ -330,33 +102,11 @@ class Player {
   }
 
   listen(home) {
-    const canvas = this.canvas, fingers = new Map();
-    const changed = (act) => { act(); this.stale = true; };
+        const changed = (act) => { act(); this.stale = true; };
     this.button.onclick = () => this.play(!this.playing);
     this.bar.oninput = () => { this.play(false); this.seek(Number(this.bar.value)); };
     home.onclick = () => changed(() => this.orbit.reset());
-    canvas.oncontextmenu = (event) => event.preventDefault();
-    canvas.onpointerdown = (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, event);
-    };
-    canvas.onpointerup = canvas.onpointercancel = (event) => fingers.delete(event.pointerId);
-    canvas.onpointermove = (event) => {
-      const before = fingers.get(event.pointerId);
-      if (!before) return;
-      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
-      const other = [...fingers.values()].find((finger) => finger.pointerId !== event.pointerId);
-      if (other) {
-        const gap = (finger) => Math.hypot(finger.clientX - other.clientX, finger.clientY - other.clientY);
-        changed(() => this.orbit.zoom(gap(before) / Math.max(gap(event), 1)));
-      } else if (event.shiftKey || event.buttons & 6) changed(() => this.orbit.pan(dx, dy, canvas.clientHeight));
-      else changed(() => this.orbit.turn(0.008 * dx, 0.008 * dy));
-      fingers.set(event.pointerId, event);
-    };
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      changed(() => this.orbit.zoom(Math.exp(Math.max(-0.5, Math.min(0.5, 0.0012 * event.deltaY)))));
-    }, { passive: false });
+    steer(this.canvas, this.orbit, changed);
     window.onkeydown = (event) => {
       if (event.target !== document.body) return;
       if (event.key === " ") this.play(!this.playing);
@@ -369,11 +119,4 @@ class Player {
   }
 }
 
-try {
-  window.player = new Player(readMotion(content("motion")), JSON.parse(content("settings")));
-} catch (error) {
-  const trouble = document.getElementById("trouble");
-  trouble.textContent = error.message;
-  trouble.style.display = "grid";
-  throw error;
-}
+window.player = reported(() => new Player(readMotion(content("content")), JSON.parse(content("settings"))));

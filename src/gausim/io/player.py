@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import math
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from jinja2 import Template
 from torch import Tensor
 
-from gausim.core import Cameras, GaussianScene, Trajectory
+from gausim.core import Cameras, DataError, GaussianScene, Trajectory
 from gausim.io.files import write_durably
 from gausim.io.motion import motion_glb
 
@@ -38,27 +39,47 @@ def save_player(
         DataError: the trajectory is of another scene, or goes beyond half floats.
         DivergenceError: a frame is not finite.
     """
-    settings = {
-        "camera": _first_view(scene, camera, up),
-        "background": [0.0, 0.0, 0.0] if background is None else background.tolist(),
-    }
-    folder = files("gausim.io")
-    template = Template(folder.joinpath("player.html").read_text(encoding="utf-8"), keep_trailing_newline=True)
-    page = template.render(
-        settings=json.dumps(settings),
-        script=folder.joinpath("player.js").read_text(encoding="utf-8"),
-        motion=base64.b64encode(motion_glb(scene, trajectory, up=up).to_bytes()).decode(),
-        title=html.escape(f"{scene.name} - gausim"),
-    )
+    content = motion_glb(scene, trajectory, up=up).to_bytes()
+    settings = view_settings(scene, camera, up=up, background=background)
+    page = rendered("player", ("player",), content, settings, title=f"{scene.name} - gausim")
     write_durably(Path(path), page.encode())
 
 
-def _first_view(scene: GaussianScene, camera: Cameras, up: str) -> dict[str, object]:
-    """Eye, target, vertical axis and field of view of the smaller side [radian]."""
+def rendered(name: str, scripts: Sequence[str], content: bytes, settings: dict[str, object], **texts: object) -> str:
+    """A page of the Gaussians' painter from the template NAME.html, with more scripts, and binary content as base64.
+
+    All texts and numbers are data: ``settings`` are JSON in which no ``<`` is left, ``texts`` are escaped.
+
+    Raises:
+        DataError: a number of the settings is not finite.
+    """
+    folder = files("gausim.io")
+
+    def read(file: str) -> str:
+        return folder.joinpath(file).read_text(encoding="utf-8")
+
+    try:
+        known = json.dumps(settings, allow_nan=False).replace("<", "\\u003c")
+    except ValueError as error:
+        raise DataError(f"the page's settings: expected finite numbers ({error}). Train the run again.") from error
+    return Template(read(f"{name}.html"), keep_trailing_newline=True).render(
+        settings=known,
+        shaders=read("splats.html"),
+        script="\n".join(read(f"{part}.js") for part in ("splats", *scripts)),
+        content=base64.b64encode(content).decode(),
+        **{key: html.escape(str(text)) for key, text in texts.items()},
+    )
+
+
+def view_settings(
+    scene: GaussianScene, camera: Cameras, *, up: str, background: Float[Tensor, " 3"] | None
+) -> dict[str, object]:
+    """Camera (eye, target, vertical axis and field of view of the smaller side [radian]), and background colour."""
     eye, forward = camera.centers[0].double(), camera.viewmats[0, 2, :3].double()
     middle = scene.means[scene.foreground].median(0).values.double()
     distance = float((middle - eye) @ forward)
     target = eye + forward * (distance if distance > 0 else scene.diagonal)
     vertical = torch.tensor([float(axis == up[-1]) for axis in "xyz"]) * (-1 if up.startswith("-") else 1)
     fov = 2 * math.atan(min(camera.width, camera.height) / (2 * float(camera.Ks[0, 1, 1])))
-    return {"eye": eye.tolist(), "target": target.tolist(), "up": vertical.tolist(), "fov": fov}
+    view = {"eye": eye.tolist(), "target": target.tolist(), "up": vertical.tolist(), "fov": fov}
+    return {"camera": view, "background": [0.0, 0.0, 0.0] if background is None else background.tolist()}

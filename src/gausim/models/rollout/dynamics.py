@@ -27,9 +27,17 @@ class SceneDynamics:
 
     takes_hands: bool = True
 
-    def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
-        """Binds ``model`` to its scene ``scene_id``; ``energy_ceiling`` as for :class:`SceneStepper`."""
+    def __init__(
+        self,
+        model: GausSim,
+        scene_id: int = 0,
+        *,
+        energy_ceiling: float | None = None,
+        correction_scale: float = 1.0,
+    ) -> None:
+        """Binds ``model`` to its scene ``scene_id``; the other arguments are those of :class:`SceneStepper`."""
         self.model, self.scene_id, self.energy_ceiling = model, scene_id, energy_ceiling
+        self.correction_scale = correction_scale
 
     @property
     @torch.no_grad()
@@ -52,7 +60,10 @@ class SceneDynamics:
 
     def stepper(self, initial: SimState, hands: Hands | None = None) -> SceneStepper:
         """Stepper from an initial state; its steps are those of :meth:`rollout`."""
-        return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling, hands=hands)
+        return SceneStepper(
+            self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling, hands=hands,
+            correction_scale=self.correction_scale,
+        )  # fmt: skip
 
 
 class MaterialDynamics(SceneDynamics):
@@ -104,6 +115,7 @@ class SceneStepper:
         *,
         energy_ceiling: float | None = None,
         hands: Hands | None = None,
+        correction_scale: float = 1.0,
     ) -> None:
         """Begins at ``initial``, a state of the model's scene ``scene_id``.
 
@@ -113,6 +125,7 @@ class SceneStepper:
             initial: positions at frames 0 and -1.
             energy_ceiling: the highest energy that forces may reach, for models with an energy; None: no limit.
             hands: poses of the hands that move the pins, by frame.
+            correction_scale: factor on the network's output; 0: the template alone.
         """
         batch = model.batch((scene_id,))
         member, prepared = batch.members[0], model.prepare(batch, driven=hands is not None)
@@ -124,7 +137,8 @@ class SceneStepper:
         self.unit_of_kernel: Int[Tensor, " K"] = member.unit_of_kernel
 
         def step(state: SimState, force: Tensor | None) -> Frame:
-            return model.step(batch, state, force, prepared, hands=[hand_motion(self._hands, self._number)])
+            hands = [hand_motion(self._hands, self._number)]
+            return model.step(batch, state, force, prepared, correction_scale, hands)
 
         graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves and not model.history
         self._step = GraphedStep(step, batch.rest) if graphed else step

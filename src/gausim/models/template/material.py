@@ -102,6 +102,8 @@ class Matrices:
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
     tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
     growth: Tensor | float  # resistance to the growth of length or strain over that to it [frames]
+    viscosity: Tensor  # the part of K in D [frames]
+    rate: Tensor  # the part of inertia beyond the mass in D [1 / frame]
 
 
 class MaterialTemplate(Template):
@@ -235,14 +237,15 @@ class MaterialTemplate(Template):
         inertia, dragged = _inertia(body, density, between, (drag * frame * units[:, 2].exp()).div(2).tanh())
         rate = _trace(dragged) / _trace(inertia)
         stiffness = k * stiffness
-        mass, damping = inertia, dragged + (rate / 4 + viscosity / frame) * stiffness
+        viscous = rate / 4 + viscosity / frame
+        mass, damping = inertia, dragged + viscous * stiffness
         if body.cells is not None:
             slowed = (stiffness.diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
             inertia, damping = mass + slowed, damping + rate * slowed
         tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - strength)
         return Matrices(
             stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
-            tense, self.links.damping / frame,
+            tense, self.links.damping / frame, viscous, rate,
         )  # fmt: skip
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:

@@ -1,0 +1,144 @@
+"""A trained template in one HTML page that simulates it: WebGL 2, no library, no network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import Cameras, DataError, GaussianScene
+from gausim.io.files import write_durably
+from gausim.io.motion import quantised_harmonics
+from gausim.io.player import rendered, view_settings
+
+# Arrays that are stored as half floats: none of them drives the motion.
+HALF = ("quats", "opacities", "base", "gradients", "cells")
+# What is in -1..1 is stored in 16 bits, in equal steps: near 1 these are finer than half floats.
+STEPS = 32767
+
+
+@dataclass(frozen=True)
+class Start:
+    """The learned initial state of a recorded sequence."""
+
+    name: str
+    before: list[float]  # modal coordinates at t = -1; those at t = 0 are zero
+    frames: int  # number of recorded frames
+    seen: int  # number of frames in training
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticPage:
+    """An object with N units and M modes; modes and directions are in the scene's axes."""
+
+    scene: GaussianScene
+    centres: Float[Tensor, "N 3"]  # centres of mass of the units at rest [scene units]
+    unit_of_kernel: Int[Tensor, " K"]  # N for kernels that never move
+    modes: Float[Tensor, "N 3 M"]
+    gradients: Float[Tensor, "N 3 3 M"]  # displacement gradients of the modes [1 / scene units]
+    weights: Float[Tensor, " N"]  # z = sum_n weight_n Phi_n^T u_n
+    wind: Float[Tensor, "3 M"]  # change of z by an acceleration of the wind along each axis
+    step: Mapping[str, np.ndarray]  # :func:`gausim.models.template.reduced.reduced_step`
+    numbers: Mapping[str, float]  # of the step
+    starts: Sequence[Start]
+    fps: float  # frames per second
+    gravity: float  # unit of weight [scene units / s^2]
+    ceiling: float  # highest energy that forces may reach
+    conserve_volume: bool  # whether the units' deformation gradients are scaled to determinant 1
+    about: Sequence[tuple[str, str]]  # what the page was made from: heading and text
+
+
+def save_page(
+    path: Path | str,
+    page: ElasticPage,
+    camera: Cameras,
+    *,
+    up: str = "z",
+    background: Float[Tensor, " 3"] | None = None,
+) -> dict[str, int]:
+    """Writes the page; replaces the file atomically.
+
+    ``camera``, ``up`` and ``background`` are those of :func:`gausim.io.player.save_player`.
+
+    Returns:
+        Bytes of the file by part: ``splats``, ``modes``, ``step`` and ``code``.
+
+    Raises:
+        DataError: a number is not finite.
+    """
+    levels, scales = quantised_harmonics(page.scene)
+    step = dict(page.step)
+    if "quadratic" in step:
+        step["quadratic"], step["pair_scales"] = _scaled(step["quadratic"])
+        step["cells"] = page.scene.diagonal * step["cells"]
+    parts = {"splats": _splats(page, levels), "modes": _modes(page), "step": step}
+    index, blobs, sizes = {}, [], dict[str, int]()
+    for part, arrays in parts.items():
+        begin = sum(map(len, blobs))
+        for name, array in arrays.items():
+            blob, kind = _packed(name, array)
+            index[name] = [kind, sum(map(len, blobs)), array.size]
+            blobs.append(blob)
+        sizes[part] = (sum(map(len, blobs)) - begin) * 4 // 3
+    scene = page.scene
+    settings = {
+        **view_settings(scene, camera, up=up, background=background),
+        "arrays": index, "sh_scales": scales, "units": len(page.centres), "modes": page.modes.shape[-1],
+        "name": scene.name, "diagonal": scene.diagonal, "fps": page.fps, "gravity": page.gravity,
+        "ceiling": page.ceiling, "conserve_volume": page.conserve_volume, "about": list(page.about),
+        "starts": [vars(start) for start in page.starts], **page.numbers,
+    }  # fmt: skip
+    scripts = ("algebra", "laws", "body", "page")
+    text = rendered("page", scripts, b"".join(blobs), settings, title=f"{scene.name} - gausim").encode()
+    write_durably(Path(path), text)
+    return {**sizes, "code": len(text) - sum(sizes.values())}
+
+
+def _splats(page: ElasticPage, levels: np.ndarray) -> dict[str, np.ndarray]:
+    scene = page.scene
+    values = {
+        "rest": scene.means, "quats": torch.nn.functional.normalize(scene.quats, dim=-1),
+        "scales": scene.log_scales.exp(), "opacities": scene.opacity_logits.sigmoid(), "base": scene.sh[:, 0],
+        "unit_of_kernel": page.unit_of_kernel,
+    }  # fmt: skip
+    return {name: value.detach().cpu().numpy() for name, value in values.items()} | {"sh": levels}
+
+
+def _modes(page: ElasticPage) -> dict[str, np.ndarray]:
+    values = {
+        "centres": page.centres, "weights": page.weights, "modes": page.modes,
+        "gradients": page.scene.diagonal * page.gradients, "wind": page.wind,
+    }  # fmt: skip
+    return {name: value.detach().cpu().numpy() for name, value in values.items()}
+
+
+def _scaled(triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A lower triangle by rows over the roots of its diagonal, in :data:`STEPS`, and these roots."""
+    count = int((2 * len(triangle)) ** 0.5)
+    rows, columns = np.tril_indices(count)
+    roots = np.sqrt(np.maximum(triangle[rows == columns], np.finfo(np.float32).tiny))
+    return (STEPS * triangle / (roots[rows] * roots[columns])).round().astype(np.int16), roots / STEPS**0.5
+
+
+def _packed(name: str, array: np.ndarray) -> tuple[bytes, str]:
+    """Bytes of an array, padded to a multiple of 12, and its type.
+
+    Raises:
+        DataError: a number is not finite, or beyond half floats.
+    """
+    if array.dtype.kind == "f":
+        array, kind = (array.astype("<f2"), "f2") if name in HALF else (array.astype("<f4"), "f4")
+        if not np.isfinite(array).all():
+            raise DataError(f"the page's '{name}': expected finite numbers, as half floats below 65504. Train again.")
+    elif array.dtype.itemsize > 2:
+        array, kind = array.astype("<u4"), "u4"
+    else:
+        kind = f"i{array.dtype.itemsize}"
+    data = np.ascontiguousarray(array).tobytes()
+    return data + bytes(-len(data) % 12), kind
