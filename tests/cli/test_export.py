@@ -1,20 +1,26 @@
 """Every format of `gausim export`, from a run and back from its files."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.bodies import NEURAL, make_model
 from helpers.glb_files import GlbFile
+from helpers.played import stand_in
+from helpers.toy_object import write_toy_object
 from PIL import Image
 
 from gausim.cli import export
 from gausim.core import ConfigError
+from gausim.core.surroundings import Surroundings
 from gausim.io.ply import save_scene
 from gausim.io.ply_sequence import load_ply_sequence
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
+from gausim.models.initial_state import ModalInitialStates
 from gausim.ops.deformed_scene import deformed_scene
 from gausim.render.draw import film
 
@@ -101,3 +107,24 @@ def test_frames_as_gltf(run) -> None:
     assert sorted(path.name for path in Path("g").iterdir()) == [f"toy_seq_000_000{i}.glb" for i in (1, 2)]
     found = GlbFile(Path("g/toy_seq_000_0002.glb")).attribute("POSITION")
     assert torch.equal(found, run.module.predict(0, 3).positions[2])
+
+
+def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    toy = write_toy_object(tmp_path / "toy")
+    model = make_model(toy.scene, **NEURAL)
+    states = ModalInitialStates(model, [0, 0])
+    run = stand_in(tmp_path / "demo" / "seed_0", toy.root, model=model, initial_states=states)
+    monkeypatch.setattr("gausim.compose.build.load_run", lambda path, **_: run)
+    command = [str(run.run_dir), "--format", "page", "--out", str(tmp_path / "p.html")]
+    assert export.main(command) == 0
+    said = capsys.readouterr().out
+    assert "36 kernels" in said and "without the network, which would move a kernel by" in said
+    page = (tmp_path / "p.html").read_text(encoding="utf-8")
+    settings = json.loads(page.split('id="settings">')[1].split("</script>")[0])
+    assert [start["name"] for start in settings["starts"]] == ["seq_000", "seq_001"]
+    assert settings["starts"][0]["frames"] > settings["starts"][0]["seen"] > 0 and settings["ceiling"] > 0
+    about = dict(settings["about"])
+    assert len(about["Data (SHA-256)"]) > 64 and "commit" in about["Made by"] and "Apache" in about["Licence"]
+    run.module.scenes = [replace(toy.scene, surroundings=Surroundings(free=True))]
+    with pytest.raises(ConfigError, match="falls.*--format html"):
+        export.main(command)

@@ -115,8 +115,8 @@ def _refuse(scene: GaussianScene, item: RunObject) -> None:
     """Refuses bodies whose reference is not at rest."""
     if not scene.surroundings.still or any(record.hands is not None for record in item.data.sequences):
         raise ConfigError(
-            f"{item.data.name}: the body falls, lies on a floor or is held by moving hands, and --format page simulates "
-            "bodies in fixed pins. Export it with --format html, or play it with `gausim view`."
+            f"{item.data.name}: the body falls, lies on a floor or is held by moving hands, and --format page "
+            "simulates bodies in fixed pins. Export it with --format html, or play it with `gausim view`."
         )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -78,14 +77,14 @@ def save_page(
         step["quadratic"], step["pair_scales"] = _scaled(step["quadratic"])
         step["cells"] = page.scene.diagonal * step["cells"]
     parts = {"splats": _splats(page, levels), "modes": _modes(page), "step": step}
-    index, blobs, sizes = {}, [], dict[str, int]()
+    index, content, sizes = dict[str, list[object]](), bytearray(), dict[str, int]()
     for part, arrays in parts.items():
-        begin = sum(map(len, blobs))
+        begin = len(content)
         for name, array in arrays.items():
-            blob, kind = _packed(name, array)
-            index[name] = [kind, sum(map(len, blobs)), array.size]
-            blobs.append(blob)
-        sizes[part] = (sum(map(len, blobs)) - begin) * 4 // 3
+            data, kind = _packed(name, array)
+            index[name] = [kind, len(content), array.size]
+            content += data
+        sizes[part] = (len(content) - begin) * 4 // 3
     scene = page.scene
     settings = {
         **view_settings(scene, camera, up=up, background=background),
@@ -95,7 +94,7 @@ def save_page(
         "starts": [vars(start) for start in page.starts], **page.numbers,
     }  # fmt: skip
     scripts = ("algebra", "laws", "body", "page")
-    text = rendered("page", scripts, b"".join(blobs), settings, title=f"{scene.name} - gausim").encode()
+    text = rendered("page", scripts, bytes(content), settings, title=f"{scene.name} - gausim").encode()
     write_durably(Path(path), text)
     return {**sizes, "code": len(text) - sum(sizes.values())}
 

@@ -26,6 +26,8 @@ from gausim.report.study import Study, counted, make_study
 from gausim.results.pivot import Grid, cell_texts
 from gausim.results.table import Made
 
+# In a run's directory, where `gausim export RUN --format page --out RUN/page.html` puts it.
+PAGE_TO_PULL = "page.html"
 CSV_HEAD = (
     "row", "kind", "object", "split", "views", "metric", "seed", "value", "deviation", "unit", "status", "runs",
     "config", "commit", "scene_sha256", "manifest_sha256",
@@ -74,6 +76,10 @@ class Sources:
     def link(self, run: RunRecord) -> str:
         """Relative path of a run's directory."""
         return quote(Path(os.path.relpath(run.path.resolve(), self._out)).as_posix())
+
+    def page_to_pull(self, run: RunRecord) -> str:
+        """Relative path of the page that simulates a run's object; empty without it."""
+        return f"{self.link(run)}/{PAGE_TO_PULL}" if (run.path / PAGE_TO_PULL).is_file() else ""
 
 
 def write_report(
