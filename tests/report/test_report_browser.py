@@ -18,6 +18,8 @@ def test_the_page_plays_and_fits(tmp_path: Path) -> None:
     from gausim.report.write import write_report
 
     root = report_runs.write_sweep(tmp_path / "sweep")
+    for run in root.rglob("config.yaml"):
+        (run.parent / "page.html").touch()
     write_report([root], root / "report")
     with chromium(tmp_path, size=(400, 800)) as page:
         page.open((root / "report" / "report.html").as_uri())
@@ -31,6 +33,7 @@ def test_the_page_plays_and_fits(tmp_path: Path) -> None:
         time.sleep(0.3)
         assert page.run("document.documentElement.scrollWidth") == 400
         page.run("document.querySelectorAll('details').forEach(d => d.open = false)")
+        assert page.run("[...document.querySelectorAll('.opening a')].some(a => a.href.endsWith('/page.html'))")
         page.run("document.querySelector('td a').click()")
         page.wait(lambda: page.run("document.getElementById('runs').open"), 10, "a number's link opens the runs")
         assert not page.problems and all(r.startswith(("file:", "data:")) for r in page.requests)
