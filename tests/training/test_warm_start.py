@@ -15,6 +15,9 @@ from gausim.compose.config import compose
 from gausim.runs.checkpoint import read_checkpoint
 from gausim.training import modal_fit
 from gausim.training.optimizers import OptimizerSettings
+from gausim.training.plan import WarmStart
+from gausim.training.tracking import Track
+from gausim.training.warm_start import warm_start
 
 QUICK = [x for x in SMALLEST if "warm_start" not in x] + [
     "model.simulator.template.modes=6", "render=cpu", "logger=none", "trainer.motion_epochs=0", "evaluate=false",
@@ -98,6 +101,25 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
     distances = torch.stack([d.mean() for d in known(12).distances(model.modal_scene(0))])
     assert len(later) == 60 and later[-2] > 1 and later[-1] == min(later[30:])
     assert float(distances.mean()) == pytest.approx(later[-1], rel=1e-4)
+
+
+@pytest.mark.parametrize("law", ["solid", "springs"])
+@torch.no_grad()
+def test_initial_states_are_found_in_the_motion_of_a_frozen_model(toy: Path, law: str) -> None:
+    torch.manual_seed(0)
+    module, _ = build(compose([f"data.root={toy}", "model=gausim", f"data.law={law}", *QUICK]))
+    states, true = module.initial_states, 0.7 * torch.randn(2, 6)
+    module.model.freeze(scenes=True)
+    tracks = []
+    for number, own in enumerate(true):
+        states.parameter(number)[:6] = own
+        moved = module.method.predict(number, 4).positions - module.model.scenes[0].means
+        tracks.append(Track(0, number, moved))
+        states.set_motion(number, moved[1])
+    assert (states.parameter(0)[:6] - true[0]).norm() > 0.05 * true[0].norm()
+    warm_start(module, tracks, WarmStart(), quiet=True)
+    for number, own in enumerate(true):
+        torch.testing.assert_close(states.parameter(number)[:6], own, rtol=0.02, atol=0.02)
 
 
 def test_the_fit_has_the_settings_of_the_model_and_what_it_leaves_is_said(

@@ -14,14 +14,16 @@ from gausim.core.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
 
-EPILOG = """The result is a run of its own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the
-state before frame 0 of each sequence, nothing else: network, densities, attributes and template stay bit by bit.
+EPILOG = """States are fitted to the motion tracked in the videos, then to the images. The result is a run of its
+own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the state before frame 0 of each sequence,
+nothing else: network, densities, attributes and template stay bit by bit.
 Only frames 0 .. FRAMES - 1 of the training views are read.
 
   gausim adapt outputs/bunny/seed_0 --sequences seq_009 seq_010 seq_011
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
-EPOCHS, REPEATS = 60, 4
+# Epochs from tracked motion, and from rest; shows of each sequence per epoch.
+WARM_EPOCHS, EPOCHS, REPEATS = 1, 60, 4
 # Targets of `--supervision`, with the same defaults as conf/supervision.
 SUPERVISIONS = {
     "images": "gausim.training.supervision.images.training_views",
@@ -56,8 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", metavar="STORE", nargs="+", help="take the objects from these directories (default: the run's)")
     add_names(parser, "sequences", "fit these sequences (default: all)")
     add("--frames", type=int, default=16, help="fit so many frames of each sequence (default: 16)")
-    add("--epochs", type=int, default=EPOCHS, help=f"go so often over the sequences, {REPEATS} steps each (default: "
-        f"{EPOCHS})")  # fmt: skip
+    add("--epochs", type=int, help=f"go so often over the sequences, {REPEATS} steps each (default: {WARM_EPOCHS} "
+        f"from tracked motion, {EPOCHS} of bodies or models of which none can be tracked)")  # fmt: skip
     add("--out", metavar="DIR", type=Path, help="write this run directory (default: NAME_adapted_FRAMES beside RUN's)")
     add("--overwrite", action="store_true", help="replace the run that is there")
     add("--set", metavar="KEY=VALUE", nargs="+", default=[], help="change settings of the run, e.g. "
@@ -83,14 +85,14 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "part": None,
         "sequences": arguments.sequences,
     }
+    warm = config["plan"]["warm_start"] and arguments.supervision != "points"
     plan = config["plan"] | {
         "repeats": REPEATS,
         "batch_size": min(4, count) if count else config["plan"]["batch_size"],
         "t_start": steps,
         "t_max": steps,
-        "epochs": arguments.epochs,
+        "epochs": arguments.epochs or (WARM_EPOCHS if warm else EPOCHS),
         "max_minutes": None,
-        "warm_start": None,
         "teach": None,
     }
     adapted = config | {

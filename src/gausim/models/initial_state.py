@@ -158,14 +158,18 @@ class ModalInitialStates(InitialStates):
         sizes = [b.shape[-1] + (START if free else 0) for b, free in zip(self._basis, self._is_free, strict=True)]
         self.velocity = nn.ParameterList(torch.zeros(sizes[i]) for i in self.scene_of_sequence)
 
+    def basis(self, sequence_id: int) -> Float[Tensor, "K 3 M"]:
+        """The motions phi_m of a sequence [scene units]."""
+        return self._basis[self.scene_of_sequence[sequence_id]].to(self.velocity[sequence_id])
+
     def parameter(self, sequence_id: int) -> nn.Parameter:
         """The amplitudes, and the start of a free body in twelve more numbers."""
         return self.velocity[sequence_id]
 
     def motion(self, sequence_id: int) -> Float[Tensor, "K 3"]:
         """The motion o [scene units]."""
-        basis, velocity = self._basis[self.scene_of_sequence[sequence_id]], self.velocity[sequence_id]
-        return basis.to(velocity) @ velocity[: basis.shape[-1]]
+        basis, velocity = self.basis(sequence_id), self.velocity[sequence_id]
+        return basis @ velocity[: basis.shape[-1]]
 
     @torch.no_grad()
     def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:

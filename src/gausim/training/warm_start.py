@@ -21,6 +21,7 @@ from gausim.models.initial_state import InitialStates
 from gausim.models.step.simulator import GausSim
 from gausim.runs.bar import with_bar
 from gausim.training import modal_fit
+from gausim.training.initial_fit import fit_initial_states
 from gausim.training.learner import Learner
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.optimizers import OptimizerSettings
@@ -34,6 +35,8 @@ KEPT = 10
 def warm_start(learner: Learner, tracks: Sequence[Track], settings: WarmStart, *, quiet: bool = False) -> None:
     """Fits initial states and material to tracked motion (:func:`gausim.training.tracking.track`).
 
+    Of a frozen model only initial states are fitted (:mod:`gausim.training.initial_fit`).
+
     Raises:
         ConfigError: the template has no material to fit.
     """
@@ -41,6 +44,9 @@ def warm_start(learner: Learner, tracks: Sequence[Track], settings: WarmStart, *
     if not isinstance(model, GausSim) or not model.template.has_energy:
         raise ConfigError("plan.warm_start: expected a template with a material. Set plan.warm_start=null.")
     groups = {name: own for name, own in learner.groups().items() if name != "network"}
+    if not any(p.requires_grad for name, own in groups.items() for p in own if name != "initial"):
+        fit_initial_states(learner, tracks, quiet=quiet)
+        return
     scenes: dict[int, list[Track]] = {}
     for known in tracks:
         scenes.setdefault(known.scene_id, []).append(known)

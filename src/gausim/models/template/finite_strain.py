@@ -74,19 +74,22 @@ class FiniteStrain(nn.Module):
         return -(beyond.flatten(1) @ self.gradients)
 
     def stiffening(
-        self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0
-    ) -> Float[Tensor, "S M M"]:
+        self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0,
+        *, buckling: bool = False,
+    ) -> Float[Tensor, "S M M"]:  # fmt: skip
         """Twice the negative derivative of :meth:`between` with respect to z of the second state.
 
         With the mean F and S of both deformation gradients and stresses, F_2 of the second state and a motion H, that
         is H S + (1 + 2 damping) F sigma(sym(F_2^T H)) - sigma(sym H). Compressed matter buckles; S is then made
-        positive semi-definite by an isotropic tension, so that with the linear stiffness this is, too.
+        positive semi-definite by an isotropic tension, so that with the linear stiffness this is, too. With
+        ``buckling`` it is not, and the derivative is exact.
         """
         one = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
         gradient, stress = self._means(first, second, factor, damping)
-        own = stress.diagonal(dim1=-2, dim2=-1)
-        least = (own - (stress.abs().sum(-1) - own.abs())).amin(-1)  # Gershgorin's bound of the eigenvalues
-        stress = stress + (-least).clamp_min(0)[..., None, None] * one
+        if not buckling:
+            own = stress.diagonal(dim1=-2, dim2=-1)
+            least = (own - (stress.abs().sum(-1) - own.abs())).amin(-1)  # Gershgorin's bound of the eigenvalues
+            stress = stress + (-least).clamp_min(0)[..., None, None] * one
         weight = ((self.volume[:, None] * factor) @ self.moduli)[..., None]
         mean, last, rest = (
             (f.flatten(-2) @ self.measures).unflatten(-1, (7, 9)) for f in (gradient + one, second.gradient + one, one)

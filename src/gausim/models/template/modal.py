@@ -26,8 +26,10 @@ class NonlinearForce(Protocol):
     def between(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
         """Mean force (S, M) from one state to another."""
 
-    def stiffening(self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0) -> Tensor:
-        """By how much it makes the body stiffer (S, M, M)."""
+    def stiffening(
+        self, first: Any, second: Any, factor: Tensor, damping: Tensor | float = 0.0, *, buckling: bool = False
+    ) -> Tensor:
+        """By how much it makes the body stiffer (S, M, M); with ``buckling``, also where it makes it softer."""
 
     def potential(self, state: Any, factor: Tensor) -> Tensor:
         """Potential energy (S,)."""
@@ -137,6 +139,21 @@ class ModalScene:
             change = (used @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
             bend = bend + change
         return Solved(z + speed + bend, used, change.detach())
+
+    def derivatives(
+        self, previous: Float[Tensor, "S M"], z: Float[Tensor, "S M"], after: Float[Tensor, "S M"]
+    ) -> tuple[Float[Tensor, "S M M"], Float[Tensor, "S M M"]]:
+        """Derivatives of z_{t+1} with respect to z_{t-1} and to z_t, at a step without load."""
+        law, factor, damping = self.nonlinear, self.factor, self.growth
+        first, second = (law.strain_state((z + end) / 2) for end in (previous, after))
+        ahead = law.stiffening(first, second, factor, damping, buckling=True) / 4
+        behind = law.stiffening(second, first, factor, -damping, buckling=True) / 4
+        lost, quarter = self.damping / 2, self.stiffness / 4
+        inverse = torch.linalg.inv_ex(self.inertia + quarter + lost + ahead)[0]
+        return (
+            inverse @ (lost - self.inertia - quarter - behind),
+            inverse @ (2 * (self.inertia - quarter) - ahead - behind),
+        )
 
     def overshoot(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """The part of a displacement by an impulse that its frame does not reach.

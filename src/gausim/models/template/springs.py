@@ -81,8 +81,9 @@ class Springs(nn.Module):
         return Stretched(change, length, grown / (length + self.length), along)
 
     def stiffening(
-        self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0
-    ) -> Float[Tensor, "S M M"]:
+        self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0,
+        *, buckling: bool = False,
+    ) -> Float[Tensor, "S M M"]:  # fmt: skip
         """Twice the negative derivative of :meth:`between` with respect to z of the second state.
 
         With d and l the means of both springs and of both lengths, n_0 and n the directions at rest and in the second
@@ -91,7 +92,8 @@ class Springs(nn.Module):
             ((1 + 2 damping) / l - t / l) d n^T + t I - n_0 n_0^T
 
         For one and the same state without damping this is the change of the stiffness from rest to it. Compressed
-        springs (t < 0) buckle; for them t I is left out, so that this matrix is positive semi-definite then.
+        springs (t < 0) buckle; for them t I is left out, so that this matrix is positive semi-definite then. With
+        ``buckling`` it is not, and the derivative is exact.
         """
         k, length = factor * self.stiffness, (first.length + second.length) / 2
         middle = (first.change + second.change) / 2 + self.offset
@@ -100,7 +102,9 @@ class Springs(nn.Module):
         towards = self._along((second.change + self.offset) / second.length[..., None])
         rest = self._along(self.offset / self.length[:, None])
         turned = grown[..., None] * towards[..., None, :]
-        turned = turned.addcmul_((k * t.clamp_min(0))[..., None, None], self.modes.unflatten(0, (-1, 3)))
+        turned = turned.addcmul_(
+            (k * (t if buckling else t.clamp_min(0)))[..., None, None], self.modes.unflatten(0, (-1, 3))
+        )
         return self.modes.mT @ turned.flatten(-3, -2) - rest.mT @ (k[:, None] * rest)
 
     def _along(self, direction: Float[Tensor, "*S E 3"]) -> Float[Tensor, "*S E M"]:
