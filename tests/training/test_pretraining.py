@@ -215,3 +215,23 @@ def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus:
     for epoch in range(3):
         assert max(key.start + key.steps for batch in _batches(data, epoch) for key in batch) <= 7
     assert len(data.index.ground_truth(0).positions) == 8
+
+
+def test_a_pure_network_is_pretrained_on_single_steps_from_true_states(corpus: Path, tmp_path: Path) -> None:
+    small = [word for word in SMALL if "template" not in word and "plan.t_" not in word]
+    words = ["experiment=pretrain", "model=gausim_network", f"data.root={corpus}", *small, "plan.epochs=1"]
+    steps = [
+        "plan.t_start=1",
+        "plan.t_max=1",
+        "plan.repeats=1",
+        "loss.rest_image_weight=0",
+        "trainer.progress=false",
+        "trainer.motion_epochs=0",
+    ]
+    module, data = build(compose([*words, *steps]))
+    assert module.plan.teach is None and data.knows_material
+    assert all(bool((own == 0).all()) for own in module.model.attributes)  # what it decodes is learned
+    assert train.main([*words, *steps, f"hydra.run.dir={tmp_path / 'base'}"]) == 0
+    checkpoint = torch.load(tmp_path / "base/last.ckpt", weights_only=True)["state_dict"]
+    after = checkpoint["model.predictor.network.decoder.4.weight"]
+    assert bool(torch.isfinite(after).all()) and float(after.abs().max()) > 0  # it started from zero

@@ -18,6 +18,7 @@ from gausim.core import ConfigError, TakesOver
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.pretraining import CorpusDataModule
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
 from gausim.results.looks import TEST_PART
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import EPOCHS
@@ -167,7 +168,8 @@ def _begin(cfg: DictConfig, module: GausSimModule, datamodule: ReadyDataModule, 
         model.freeze(scenes=cfg.freeze == "model")
     if module.initial_states is not None:
         begin_free_bodies(module, datamodule)
-    if isinstance(datamodule, CorpusDataModule) and not datamodule.knows_material and not resumed:
+    decodes = isinstance(model.template, MaterialTemplate)
+    if isinstance(datamodule, CorpusDataModule) and decodes and not datamodule.knows_material and not resumed:
         find_materials(model, datamodule)
 
 

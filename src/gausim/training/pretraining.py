@@ -36,14 +36,14 @@ class KnownStates(SharedSimulator):
     model: GausSim
 
     def __init__(self, model: GausSim, data: CorpusDataModule, scene_of_sequence: Sequence[int]) -> None:
-        """Gives the model the bodies' material if it is known."""
+        """Gives the model the bodies' material if it is known and the template decodes one."""
         self.model, self.initial_states = model, None  # type: ignore[assignment]
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._simulator, self._index, self._hands = cast(Simulator, model), data.index, {}
-        if data.knows_material:
+        if data.knows_material and isinstance(model.template, MaterialTemplate):
             for scene_id, item in enumerate(data.objects):
                 give_material(model, scene_id, item.body)
-            cast(MaterialTemplate, model.template).damping.requires_grad_(False)
+            model.template.damping.requires_grad_(False)
 
     def groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """The model's parameter groups."""
