@@ -18,7 +18,9 @@ from torch import Tensor
 from gausim.core import DataError
 
 # Ridges among which one is chosen on the seen frames [mean squares of the coordinates].
-RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+# Largest growth per frame of a chosen fit, twofold in 35 frames: bodies without a drive do not grow.
+MOST_GROWTH = 1.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,14 @@ class LinearAR:
     def order(self) -> int:
         """The number p of frames from which a rollout starts."""
         return len(self.coefficients)
+
+    @property
+    def growth(self) -> float:
+        """Largest factor per frame by which a motion grows: the spectral radius of the companion matrix."""
+        order, size, _ = self.coefficients.shape
+        kept = torch.eye(size * (order - 1), size * order).to(self.coefficients)
+        companion = torch.cat((self.coefficients.transpose(0, 1).flatten(1), kept))
+        return float(torch.linalg.eigvals(companion).abs().max())
 
     def rollout(self, displacement: Float[Tensor, "p P 3"], steps: int) -> Float[Tensor, "F P 3"]:
         """Predicts ``steps`` frames after frame 0 from the displacements in the first p frames, which come first."""
@@ -72,12 +82,12 @@ def fit_linear_ar(
 def choose_linear_ar(displacements: Sequence[Float[Tensor, "F P 3"]], sizes: Sequence[int], order: int) -> LinearAR:
     """Of several numbers of modes and :data:`RIDGES` those that predict a sequence best that was left out.
 
-    Of a single sequence the first two thirds of its frames predict all.
+    Of a single sequence the first two thirds of its frames predict all. A fit that grows is chosen only if all do.
 
     Raises:
         DataError: as :func:`fit_linear_ar`.
     """
-    least, chosen = float("inf"), (sizes[0], RIDGES[0])
+    found: list[tuple[bool, float, LinearAR]] = []
     for n_modes, ridge in itertools.product(sizes, RIDGES):
         error = 0.0
         for number, own in enumerate(displacements):
@@ -85,9 +95,9 @@ def choose_linear_ar(displacements: Sequence[Float[Tensor, "F P 3"]], sizes: Seq
             others = [*displacements[:number], *displacements[number + 1 :]] or [part]
             made = fit_linear_ar(others, n_modes, order, ridge=ridge).rollout(own[:order], len(own) - 1)
             error += float((made - own).square().mean())
-        if error < least:
-            least, chosen = error, (n_modes, ridge)
-    return fit_linear_ar(displacements, chosen[0], order, ridge=chosen[1])
+        whole = fit_linear_ar(displacements, n_modes, order, ridge=ridge)
+        found.append((whole.growth > MOST_GROWTH, error, whole))
+    return min(found, key=lambda own: own[:2])[2]
 
 
 def _coordinates(displacements: Sequence[Tensor], n_modes: int) -> tuple[Tensor, list[Tensor]]:
