@@ -119,7 +119,7 @@ def test_frames_and_pictures_are_those_of_python(model: GausSim, tmp_path: Path)
             with Image.open(io.BytesIO(base64.b64decode(page.run("page.shot").split(",")[1]))) as image:
                 seen = np.asarray(image.convert("RGB")).astype(float)
             error = np.mean((seen - expected_picture) ** 2)
-            assert 10 * np.log10(255**2 / max(error, 1e-9)) > 30, f"frame {4 * number + 4}: mean square {error}"
+            assert 10 * np.log10(255**2 / max(error, 1e-9)) > 40, f"frame {4 * number + 4}: mean square {error}"
 
 
 @needs_chromium

@@ -164,6 +164,7 @@ class Page {
   mark(camera) {
     const ink = this.marks.getContext("2d");
     ink.clearRect(0, 0, this.marks.width, this.marks.height);
+    this.marks.hidden = !this.grab && !this.pins.size;
     const ring = (unit, color) => {
       const [x, y] = this.seen(camera, this.centre(unit));
       Object.assign(ink, { strokeStyle: color, lineWidth: 2 });

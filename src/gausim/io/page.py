@@ -102,7 +102,7 @@ def save_page(
 def _splats(page: ElasticPage, levels: np.ndarray) -> dict[str, np.ndarray]:
     scene = page.scene
     values = {
-        "rest": scene.means, "quats": torch.nn.functional.normalize(scene.quats, dim=-1),
+        "rest": scene.means, "quats": torch.nn.functional.normalize(scene.quats, dim=-1).roll(-1, -1),  # xyzw
         "scales": scene.log_scales.exp(), "opacities": scene.opacity_logits.sigmoid(), "base": scene.sh[:, 0],
         "unit_of_kernel": page.unit_of_kernel,
     }  # fmt: skip
