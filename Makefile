@@ -54,6 +54,7 @@ docs: install results ## Build the documentation into site/ (serve it: .venv/bin
 
 results: install ## Make docs/results.md from its records (docs/results/, which `gausim report DIR --record` writes)
 	$(BIN)/gausim report --page docs/results.md
+	$(BIN)/python docs/figures.py
 
 lint: install ## Check style, formatting, types, import directions and declared dependencies
 	$(BIN)/ruff check .
