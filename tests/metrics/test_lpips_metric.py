@@ -10,10 +10,10 @@ from helpers.plain import Call
 from helpers.waves import pair
 from safetensors.torch import load_file, save_file
 
+from data_prep.lpips import PUBLISHED, convert, digest, holds_published
 from gausim.core import DataError
 from gausim.metrics import LPIPS
 from gausim.metrics.lpips import SHAPES, expected_shapes
-from gausim.metrics.lpips_weights import PUBLISHED, convert, digest, holds_published
 
 
 def random_weights(seed: int = 0) -> dict[str, torch.Tensor]:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import gausim
-from gausim.cli import prepare_lpips
 from gausim.cli.arguments import command_parser
 from gausim.core.errors import ConfigError
 
@@ -25,6 +24,7 @@ STAGES = {
     "corpus": "make random elastic bodies with known motion and material, to pretrain on",
     "synthesize": "make the embedded synthetic set: puddings and flowers that MuJoCo moves",
     "blender_bunny": "make the paper's synthetic set: any mesh as a soft body of Blender",
+    "lpips": "fetch the LPIPS weights, so that evaluations measure LPIPS",
 }
 
 
@@ -37,9 +37,8 @@ def main(argv: Sequence[str]) -> int:
             sys.path.insert(0, root)
         status: int = importlib.import_module(f"data_prep.{stage}").main(list(argv[1:]))
         return status
-    arguments = _parser().parse_args(argv)
-    status = arguments.run(arguments)
-    return status
+    _parser().parse_args(argv)
+    return 0
 
 
 def stages_root() -> Path:
@@ -60,5 +59,4 @@ def _parser() -> argparse.ArgumentParser:
     parts = parser.add_subparsers(metavar="WHAT", required=True)
     for name, line in STAGES.items():
         parts.add_parser(name, help=line, add_help=False)
-    prepare_lpips.add_to(parts)
     return parser
