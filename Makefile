@@ -53,7 +53,7 @@ docs: install results ## Build the documentation into site/ (serve it: .venv/bin
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 results: install ## Make docs/results.md from its records (docs/results/, which `gausim report DIR --record` writes)
-	$(BIN)/gausim report --page docs/results.md
+	$(BIN)/python docs/results/make.py
 	$(BIN)/python docs/figures.py
 
 lint: install ## Check style, formatting, types, import directions and declared dependencies

@@ -28,8 +28,7 @@ from gausim.io.trajectory import load_trajectory, save_trajectory
 from gausim.io.transforms import read_transforms
 from gausim.metrics import LPIPS
 from gausim.results.curves import load_curves
-from gausim.results.pictures import load_pictures
-from gausim.results.table import load_results
+from gausim.results.table import ObjectInfo, load_results
 from gausim.runs.checkpoint import AtomicCheckpointIO, read_checkpoint
 from gausim.runs.directory import RunDirectory
 
@@ -45,7 +44,8 @@ def whole(path: Path) -> object:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": read_checkpoint, "config.yaml": lambda path: RunDirectory(path.parent).config(),
-    "metrics.npz": load_curves, "pictures.npz": load_pictures, "metrics.json": load_results, "lpips.safetensors": LPIPS,
+    "metrics.npz": lambda path: load_curves(path, {"toy": ObjectInfo()}), "metrics.json": load_results,
+    "lpips.safetensors": LPIPS,
     "ground_truth.npz": lambda path: read_array(path, "payload"), "transforms.json": read_transforms,
     "scene.ply": load_scene, "scene.masks.npz": lambda path: load_masks(SCENE, path),
     "trajectory.safetensors": load_trajectory, "dataset.json": whole, "session.json": load_session,

@@ -17,7 +17,7 @@ import torch
 
 from gausim.compose.build import load_run
 from gausim.compose.live import REST, open_interaction
-from gausim.compose.predict import run_objects
+from gausim.compose.predict import run_object
 from gausim.core import Cameras, DataError, Frame, Renderer, Trajectory
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
@@ -186,5 +186,4 @@ def load(
     interaction = open_interaction(
         loaded, name=object, sequence=sequence, gravity=gravity, most_force=most_force, keep=keep
     )
-    item = run_objects(loaded, None if object is None else [object])[0]
-    return Simulation(interaction, item.data.sequences[0].cameras, loaded.renderer)
+    return Simulation(interaction, run_object(loaded, object).data.sequences[0].cameras, loaded.renderer)

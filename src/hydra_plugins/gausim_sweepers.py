@@ -29,16 +29,16 @@ class GridSweeper(BasicSweeper):
             ConfigError: an override has no value.
             RunError: a job failed.
         """
-        from gausim.cli.sweeps.jobs import conclude, launching, result_of
+        from gausim.cli.sweeps.jobs import conclude, launching
         from gausim.core.errors import ConfigError
 
         assert self.config is not None
         folder = Path(str(self.config.hydra.sweep.dir))
         with launching(folder):
             batches: Any = super().sweep(arguments)
-            results = [result_of(one) for batch in batches for one in batch]
-        if not results:
-            raise ConfigError(
-                f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
-            )
-        conclude(folder, results)
+            jobs = [job for batch in batches for job in batch]
+            if not jobs:
+                raise ConfigError(
+                    f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
+                )
+            conclude(folder, jobs)

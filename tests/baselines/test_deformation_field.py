@@ -4,8 +4,8 @@ import torch
 from helpers.fitted_methods import recorded, rolled
 
 from gausim.baselines.deformation_field import DeformationField
+from gausim.baselines.fitted import FittedDynamics
 from gausim.core import SimState
-from gausim.core.fitted import FittedDynamics
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.rotation import quaternion_to_matrix
 

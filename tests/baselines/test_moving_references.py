@@ -6,7 +6,7 @@ import torch
 from helpers.plain import plain_scene
 from scipy.spatial.transform import Rotation
 
-from gausim.baselines.references import BallisticDynamics, FollowHandsDynamics, hand_weights, rigid_fit
+from gausim.baselines.references import ballistic_motion, hand_weights, hands_motion, rigid_fit
 from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
 
 FPS = 24.0
@@ -40,7 +40,7 @@ def test_flight_is_a_parabola_with_constant_spin() -> None:
         t = frame / FPS
         return placed(body, [0.3 * t, -0.1 * t, 0.5 * t - 2.5 * t * t], [0.0, 0.9 * t, 0.0])
 
-    flown = BallisticDynamics(body, fps=FPS).rollout(SimState(at(1), at(0)), 20)
+    flown = ballistic_motion(body, SimState(at(1), at(0)), fps=FPS, steps=20)
     for frame in (0, 7, 20):
         torch.testing.assert_close(flown.positions[frame], at(frame + 1), atol=2e-5, rtol=0)
     spin = Rotation.from_rotvec([0.0, 0.9 * 21 / FPS, 0.0]).as_matrix()
@@ -50,7 +50,7 @@ def test_flight_is_a_parabola_with_constant_spin() -> None:
 def test_flight_stops_at_the_floor_for_good_but_may_leave_it() -> None:
     body = cube(floor=1.5, gravity=5.0)
     still = placed(body, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    fallen = BallisticDynamics(body, fps=FPS).rollout(SimState(still, still), 30).positions
+    fallen = ballistic_motion(body, SimState(still, still), fps=FPS, steps=30).positions
     gap = fallen[..., 2].amin(1) - 1.5
     assert gap.min() > -1e-6 and gap[-1] < 1e-6
     landed = int((gap < 1e-6).nonzero()[0, 0])
@@ -58,7 +58,7 @@ def test_flight_stops_at_the_floor_for_good_but_may_leave_it() -> None:
     assert torch.equal(fallen[landed], fallen[-1])
     # Squeezed below the floor, but on its way up.
     low, lower = placed(body, [0, 0, -0.52], [0, 0, 0]), placed(body, [0, 0, -0.6], [0, 0, 0])
-    risen = BallisticDynamics(body, fps=FPS).rollout(SimState(low, lower), 3).positions
+    risen = ballistic_motion(body, SimState(low, lower), fps=FPS, steps=3).positions
     assert risen[3, 0, 2] > still[0, 2] - 0.52 + 0.1
 
 
@@ -83,7 +83,7 @@ def beam(turn: float = 0.0) -> tuple[GaussianScene, HandPath]:
 
 def test_held_kernels_follow_their_hand_and_all_follow_both_alike() -> None:
     body, hands = beam()
-    followed = FollowHandsDynamics(body, hands, fps=FPS).rollout(SimState(body.means, body.means), 1)
+    followed = hands_motion(body, hands, fps=FPS, steps=1)
     torch.testing.assert_close(followed.positions[0], body.means)
     torch.testing.assert_close(followed.positions[1], body.means + torch.tensor([0.0, 0.1, 0.0]))
 
@@ -92,7 +92,7 @@ def test_turned_ends_bend_a_beam_into_its_static_curve() -> None:
     """Ends turned by theta and -theta: the middle of a beam rises by theta L / 4, everywhere by theta x (1 - x)."""
     turn = 0.05
     body, hands = beam(turn)
-    followed = FollowHandsDynamics(body, hands, fps=FPS).rollout(SimState(body.means, body.means), 1)
+    followed = hands_motion(body, hands, fps=FPS, steps=1)
     rise = (followed.positions[1] - body.means)[:, 2]
     free = body.hand < 0
     x = body.means[free, 0]

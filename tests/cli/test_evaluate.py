@@ -43,11 +43,11 @@ def test_whole_evaluation(run, capsys):
     folder = run.run_dir / "evaluation"
     assert "`gausim prepare lpips` gets them" in (folder / "table.md").read_text()
     lines = captured.out.splitlines()
-    assert lines[0].startswith("toy: On frames never seen") and "it predicts the motion closely." in lines[0]
+    assert lines[0].startswith("toy: Unseen frames 8–19: 3D error 0.00 of the static prediction's")
     assert lines[1] == f"tables: {(folder / 'table.md').as_uri()}" and lines[2] == f"next: gausim report {run.run_dir}"
     assert len(lines) == 4 and "not finished" not in captured.err
     names = {p.name for p in folder.iterdir()}
-    assert names == {"metrics.json", "metrics.npz", "pictures.npz", "table.md", "errors_toy.png", "motion_toy.png"}
+    assert names == {"metrics.json", "metrics.npz", "film_toy.mp4", "table.md", "errors_toy.png"}
     summary = json.loads((folder / "metrics.json").read_text())
     expected = {"name": "toy", "seed": 5, "views": "all", "finished": True, "epoch": 3, "updates": 40}
     assert summary["run"] == expected
@@ -78,10 +78,10 @@ def test_an_unfinished_run_is_measured_with_a_warning_and_lists_its_tables_on_de
 def test_a_sequence_gives_all_files(run, capsys):
     assert simulate.main([str(run.run_dir), "--gif"]) == 0
     folder = run.run_dir / "simulation" / "toy" / "seq_000"
-    views = [f"{view}{end}" for view in ("cam_0", "cam_2") for end in (".gif", ".mp4", "_sheet.png", "_slices.png")]
+    views = [f"{view}{end}" for view in ("cam_0", "cam_2") for end in (".gif", ".mp4", "_sheet.png")]
     assert {p.name for p in folder.iterdir()} == {*views, "errors.png", "trajectory.safetensors"}
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("toy seq_000: On frames never seen (8–19), its points are 0.00 times as far off")
+    assert lines[0].startswith("toy seq_000: Unseen frames 8–19: 3D error 0.00")
     assert lines[1] == f"videos: {folder.parent.as_uri()}" and len(lines) == 4
     assert lines[3].split() == ["gausim", "simulate", str(run.run_dir), *"--force on=tip weights=3 direction=x".split()]
     frames = list(read_video(folder / "cam_2.mp4"))

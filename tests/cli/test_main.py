@@ -124,7 +124,7 @@ SUBJECTS = ("missing", "empty", "file", "binary")
 CALLS = {
     "inspect": ["{}"], "reconstruct": ["{}", "--out", "out.ply"], "verify": ["{}"], "doctor": ["{}"],
     "train": ["data={}"], "adapt": ["{}"], "evaluate": ["{}"], "simulate": ["{}"], "view": ["{}"],
-    "export": ["{}", "--format", "motion"], "pack": ["{}"], "fetch": ["{}", "--sha256", "0" * 64], "report": ["{}"],
+    "export": ["{}", "--format", "motion"], "report": ["{}"],
 }  # fmt: skip
 
 

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import hydra
 import pytest
+from helpers.digests import digest
 from helpers.sweeps import Sweeps, dying, history, write_toy_object
 from hydra.core.hydra_config import HydraConfig
 
 from gausim.compose import root as _conf
-from gausim.runs.checkpoint import digest, read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 from gausim.runs.files import sole_writer
 
 FINISH = "gausim.runs.directory.RunDirectory.finish"
-SAVED = "gausim.runs.checkpoint._check_written"
+SAVED = "gausim.runs.checkpoint.read_checkpoint"
 STEP = "gausim.training.module.GausSimModule.training_step"
 
 

@@ -11,6 +11,7 @@ from lightning.pytorch.loggers import WandbLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.cli import train as command
+from gausim.io.video import read_video
 from gausim.training.callbacks import panels
 from gausim.training.module import GausSimModule
 
@@ -66,13 +67,8 @@ def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     assert [e.step for e in events.Images("toy_seq_000/video")] == [1, 2]
     assert {"objects/toy/l2", "objects/toy/ratio_static", "train/grad_network"} <= set(events.Tags()["scalars"])
-    head, line = (run / "panels" / "step_000002" / "objects.csv").read_text().splitlines()
-    row = dict(zip(head.split(","), line.split(","), strict=True))
-    assert (row["object"], row["sequence"], row["camera"], row["T"]) == ("toy", "seq_000", "cam_0", "2")
-    assert float(row["l2 x1000"]) == pytest.approx(1000 * events.Scalars("objects/toy/l2")[1].value, rel=1e-3)
-    assert float(row["l2 / static"]) == pytest.approx(float(row["l2 x1000"]) / float(row["static x1000"]), rel=1e-2)
-    frames = (run / "panels" / "step_000002" / "toy_seq_000.errors.csv").read_text().splitlines()
-    assert len(frames) == 1 + 3  # frames 0..t_max, whatever T is
+    assert {path.name for path in (run / "panels" / "step_000002").iterdir()} == {"toy_seq_000.mp4", "toy_seq_000.png"}
+    assert len(list(read_video(run / "panels" / "step_000002" / "toy_seq_000.mp4"))) == 3  # frames 0..t_max
 
 
 def test_a_panel_that_cannot_be_drawn_is_left_out(

@@ -78,7 +78,6 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     table = load_results(RUN / "evaluation" / "metrics.json").table
     found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim", "points")}
     assert float(watched[-1]["error_unseen"]) == pytest.approx(found["unseen", "error_3d_ratio"], rel=1e-3)
-    assert float(watched[-1]["error_level_1"]) == pytest.approx(found["motion", "fine_error"], rel=1e-3)
 
 
 def test_faults_of_the_data_are_told_again_at_the_end(

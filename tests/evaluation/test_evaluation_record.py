@@ -10,13 +10,12 @@ import torch
 from helpers import toy_object
 
 import gausim
-from gausim.core import Rendered
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
-from gausim.evaluation.recorder import PictureRecorder
+from gausim.io.video import read_video
 from gausim.metrics.lpips import expected_shapes
+from gausim.pictures.frames import SEEN
 from gausim.render.reference import ReferenceRenderer
-from gausim.results.pictures import load_pictures
 from gausim.runs.provenance import code_provenance
 
 
@@ -37,7 +36,7 @@ class Oracle:
 
 def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     methods = {"oracle": Oracle(toy), "bare": lambda record: toy.truth(record.name)}
-    curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer())
+    curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer(), films=tmp_path)
     results = write_evaluation(tmp_path, [curves], {"name": "toy"})
     assert results.provenance["gausim"] == gausim.__version__
     found = {(e.row, e.metric): e.value for e in results.table if e.split == ""}
@@ -47,11 +46,20 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     for key, name in (("scene", "scene.ply"), ("manifest", "dataset.json")):
         expected = hashlib.sha256((toy.root / name).read_bytes()).hexdigest()
         assert info.sources[key] == {"file": name, "sha256": expected}
-    (pictures,) = load_pictures(tmp_path / "pictures.npz")
-    assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
-    difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
-    assert pictures.truth.shape == (10, 3, 32, 32, 4) and np.abs(difference).max() <= 2
-    assert pictures.background is None and info.absent == {"lpips": "no weights"}
+    assert info.absent == {"lpips": "no weights"}
+
+
+def test_the_film_is_truth_prediction_and_error_in_the_view_held_out(toy, tmp_path):
+    curves = evaluate_object(
+        ObjectData(toy.root), toy.scene, {"oracle": Oracle(toy)}, ReferenceRenderer(), films=tmp_path
+    )
+    assert curves.info.film.startswith("seq_000 in cam_2 (held out).")
+    frames = list(read_video(tmp_path / "film_toy.mp4"))
+    assert len(frames) == 10 and frames[0].shape == (24 + 480 + 24 + 8, 3 * 480, 3)
+    truth, prediction, error = (frames[5][24:504, i * 480 : (i + 1) * 480].astype(int) for i in range(3))
+    assert np.abs(truth - prediction).mean() < 3 < truth.std() and error.mean() < 10
+    line = frames[9][-5].astype(int)
+    assert np.abs(line[100] - SEEN).max() < 16 and line[-100, 0] > 200 > line[-100, 2]  # blue, then orange
 
 
 def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
@@ -83,27 +91,3 @@ def test_the_commit_of_the_package_and_whether_it_was_changed(tmp_path):
     assert (found["commit"], found["modified"]) == (git(tmp_path, "rev-parse", "HEAD"), False)
     (package / "__init__.py").write_text("x = 1")
     assert code_provenance(package)["modified"] is True
-
-
-def recorded(frames: int = 2, size: int = 8) -> torch.Tensor:
-    """Straight alpha; the left half is the object, red; behind it the wall is blue, and grey where nothing ever is."""
-    pixels = torch.zeros(frames, 3, size, size, 4, dtype=torch.uint8)
-    pixels[..., 2] = 200
-    pixels[..., : size // 2, :] = torch.tensor([255, 0, 0, 255], dtype=torch.uint8)
-    return pixels
-
-
-def test_pictures_keep_the_background_that_was_seen(toy):
-    recorder = PictureRecorder(ObjectData(toy.root), "seq_000", toy_object.VIEWS)
-    first, second = recorded(), recorded()
-    second[:, :, :, 2:4] = torch.tensor([0, 0, 100, 0], dtype=torch.uint8)  # the object uncovers two columns
-    drawn = {"ours": Rendered(torch.full((2, 3, 8, 8, 3), 0.5), torch.full((2, 3, 8, 8), 0.5))}
-    recorder.add(first, drawn)
-    recorder.add(second, drawn)
-    pictures = recorder.finish()
-    assert pictures.truth.shape == (4, 3, 8, 8, 4) and pictures.truth[0, 0, 0, 0].tolist() == [255, 0, 0, 255]
-    assert pictures.truth[0, 0, 0, 7].tolist() == [0, 0, 0, 0]  # premultiplied
-    assert pictures.predictions["ours"][3, 2, 0, 0].tolist() == [128] * 4
-    blue = pictures.background[0, 0, :, 2].tolist()
-    # Covered throughout: the mean of what was seen, weighted by how often; uncovered: 100; always free: 200.
-    assert blue[2:] == [100, 100, 200, 200, 200, 200] and blue[0] == blue[1] == round((2 * 100 * 2 + 4 * 200 * 4) / 20)

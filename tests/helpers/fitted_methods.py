@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from gausim.core import FittedMethod, FittedState, GaussianScene
+from gausim.baselines.fitted import Fitted, FittedState
+from gausim.core import GaussianScene
 from helpers.toy_object import toy_scene
 
 
@@ -13,7 +14,7 @@ def recorded(*scenes: GaussianScene, seen: int = 7) -> dict[str, Any]:
     return {"scenes": scenes, "fps": [24.0] * count, "scene_of_sequence": [*range(count)] * 2, "seen": seen}
 
 
-def rolled(method: FittedMethod, frames: int, state: FittedState | None = None) -> list[FittedState]:
+def rolled(method: Fitted, frames: int, state: FittedState | None = None) -> list[FittedState]:
     """The beginning of sequence 0, or a given state, and the frames that follow."""
     states = [state or method.begin(0)]
     for _ in range(frames):

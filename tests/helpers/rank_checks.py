@@ -20,12 +20,12 @@ from gausim.losses import Objective
 from gausim.metrics.image import PSNR
 from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
-from gausim.runs.checkpoint import digest
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
 from helpers import toy_object
+from helpers.digests import digest
 from helpers.simulators import gausim
 
 SCENES = (0, 0, 1, 0, 1, 1)  # of sequences 0 to 5; the last is in no batch

@@ -11,8 +11,9 @@ from typing import Any, Self
 
 import torch
 
-from gausim.runs.checkpoint import digest, read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 from helpers import toy_object
+from helpers.digests import digest
 from helpers.shared import Shared
 from helpers.simulators import SMALLEST
 
@@ -130,7 +131,7 @@ def killed(target: str, count: int, **how: Any) -> dict[str, Any]:
 def learned(run: Path) -> dict[str, str]:
     """Digests of all that a checkpoint holds, seconds aside."""
     loaded = read_checkpoint(run / "last.ckpt")
-    kept = {k: v for k, v in loaded.items() if k not in ("callbacks", "cost", "digest")}
+    kept = {k: v for k, v in loaded.items() if k not in ("callbacks", "cost")}
     parts = {k: entry if isinstance(entry, dict) else {"": entry} for k, entry in kept.items()}
     return {f"{k}.{name}": digest(v) for k, entry in parts.items() for name, v in entry.items()}
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from helpers.bodies import NEURAL, make_model, make_scene, make_state, neural_model
 from helpers.simulators import silence
+from helpers.stability import LinearStep, largest_eigenvalue
 
 from gausim.core import Adjustable, ConfigError, SimState
-from gausim.evaluation.stability import _LinearStep, largest_eigenvalue
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.rollout.dynamics import scene_dynamics
@@ -291,12 +291,12 @@ def test_the_network_reads_only_what_the_modes_carry() -> None:
     with torch.no_grad():
         for weights in model.predictor.network.decoder.parameters():
             weights.normal_(generator=torch.Generator().manual_seed(3))
-    step = _LinearStep(model, 0)
+    step = LinearStep(model, 0)
     blocks = step.rows()
     alone = np.linalg.svd(blocks, compute_uv=False)
     assert step.count == 90 and (alone > 1e-6 * alone[0]).sum() == 18
     silence(model)
-    assert np.abs(_LinearStep(model, 0).rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
+    assert np.abs(LinearStep(model, 0).rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
 
 
 @torch.no_grad()

@@ -4,7 +4,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from helpers import chromium, report_runs
+
+from gausim.io.video import write_video
 
 chromium, pytestmark = chromium.chromium, chromium.needs_chromium
 PLAYING = "[...document.querySelectorAll('.film video')].map(v => !v.paused && v.currentTime > 0 && v.videoWidth > 0)"
@@ -20,6 +23,8 @@ def test_the_page_plays_and_fits(tmp_path: Path) -> None:
     root = report_runs.write_sweep(tmp_path / "sweep")
     for run in root.rglob("config.yaml"):
         (run.parent / "page.html").touch()
+    for film in root.rglob("film_*.mp4"):
+        write_video(film, [np.full((32, 96, 3), 8 * f, np.uint8) for f in range(24)], 12)
     write_report([root], root / "report")
     with chromium(tmp_path, size=(400, 800)) as page:
         page.open((root / "report" / "report.html").as_uri())
@@ -34,6 +39,4 @@ def test_the_page_plays_and_fits(tmp_path: Path) -> None:
         assert page.run("document.documentElement.scrollWidth") == 400
         page.run("document.querySelectorAll('details').forEach(d => d.open = false)")
         assert page.run("[...document.querySelectorAll('.opening a')].some(a => a.href.endsWith('/page.html'))")
-        page.run("document.querySelector('td a').click()")
-        page.wait(lambda: page.run("document.getElementById('runs').open"), 10, "a number's link opens the runs")
         assert not page.problems and all(r.startswith(("file:", "data:")) for r in page.requests)

@@ -1,9 +1,9 @@
 """Tables of reports, their files, pages made from records, and the figures of the repository's own pages."""
 
 import csv
+import importlib.util
 import io
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,14 +14,16 @@ from helpers.report_runs import config, evaluate, grids_of, make_curves, page_of
 from gausim.cli import main as cli
 from gausim.core import RunError
 from gausim.report.layouts import summary
-from gausim.report.paper import CONTRAST, TABLES, paper_object
-from gausim.report.render import page
+from gausim.report.paper import TABLES, paper_object
 from gausim.report.runs import find_runs
-from gausim.report.study import Study
 from gausim.results.pivot import Pivot, cell_texts, markdown_table
 from gausim.results.table import SCHEMA, Cell, Entry, Made, Metric, ObjectInfo, Results, load_results, save_results
 
 ROOT = Path(__file__).resolve().parents[2]
+MAKE = importlib.util.spec_from_file_location("make_results", ROOT / "docs" / "results" / "make.py")
+make_results = importlib.util.module_from_spec(MAKE)
+MAKE.loader.exec_module(make_results)
+page = make_results.page
 HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
 BOUNCE = {"height": 0.5, "rise": 0.2, "height_error": 0.1, "rise_error": 0.25, "depth": 0.3}
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -157,26 +159,20 @@ def test_the_papers_own_figures() -> None:
     for metric, expected in sums.items():
         pairs = [pair for by_object in TABLES[metric].values() for both in by_object.values() for pair in both]
         assert len(pairs) == 30 and [sum(p[i] for p in pairs) for i in (0, 1)] == pytest.approx(expected)
-    assert all(abs(sum(c * c for c in color) ** 0.5 - norm) < 0.05 for color, norm, _ in CONTRAST.values())
 
 
 # -------------------------------------------------------------------------------- bodies that fall or are in hands
 
 
-def falling_study(root: Path, reference: str = "ballistic") -> Study:
+def test_bounces_of_methods_references_and_the_truth(tmp_path: Path) -> None:
     for seed, error in ((0, 1.0), (1, 2.0)):
         made = make_curves(error)
-        made.values[reference] = made.values.pop("static")
-        rows = {"gausim": {**BOUNCE, "height": 0.4 + 0.1 * seed}, reference: {**BOUNCE, "rise": None},
-                "truth": {**BOUNCE, "height_error": 0.0, "rise_error": 0.0}}  # fmt: skip
-        made.record["bounce"] = rows
-        run = write_run(root / f"seed_{seed}", config(seed))
-        evaluate(run, replace(made, facts=replace(made.facts, reference=reference)))
-    return study_of(root)
-
-
-def test_bounces_of_methods_references_and_the_truth(tmp_path: Path) -> None:
-    falling_study(tmp_path)
+        made.values["ballistic"], made.info.reference = made.values.pop("static"), "ballistic"
+        made.bounces.update(
+            gausim={**BOUNCE, "height": 0.4 + 0.1 * seed}, ballistic={**BOUNCE, "rise": None},
+            truth={**BOUNCE, "height_error": 0.0, "rise_error": 0.0},
+        )  # fmt: skip
+        evaluate(write_run(tmp_path / f"seed_{seed}", config(seed=seed)), made)
     rows = shown(grids_of(tmp_path)["toy_bunny, bounce"])
     assert rows["gausim"] == ["0.450 ± 0.071", "10.0 ± 0.0", "0.200 ± 0.000", "25.0 ± 0.0", "0.30 ± 0.00"]
     assert rows["ballistic"][2] == "" and rows["truth"][1] == "0"
@@ -216,7 +212,7 @@ class Page(HTMLParser):
             self.bold.append(data)
 
 
-def test_the_page_stands_alone_and_every_number_leads_to_its_run(sweep: Path) -> None:
+def test_the_page_stands_alone_and_lists_its_runs(sweep: Path) -> None:
     text = page_of(sweep, pictures=False)
     found = Page(text)
     assert "default-src 'none'" in text and "script" not in found.tags and "http-equiv" in text
@@ -225,9 +221,9 @@ def test_the_page_stands_alone_and_every_number_leads_to_its_run(sweep: Path) ->
         assert link.startswith(("#", "data:", "../")), link
         assert not link.startswith("#") or link[1:] in found.anchors, link
         assert not link.startswith("../") or (sweep / "report" / link).exists(), link
-    assert "11.00" in found.bold and "15.00" not in found.bold and found.links.count("#runs-1") > 10
+    assert "11.00" in found.bold and "15.00" not in found.bold and "../full/seed_0" in found.links
     assert "c0ffeec0ffee" in found.text and "da7ada7ada7a" in found.text and "5ce7e5ce7e5c" in found.text
-    assert "conserve_mass: false" in found.text and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in found.text
+    assert "name: no_mass" in found.text and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in found.text
     markdown = (sweep / "report" / "results.md").read_text()
     for block in re.findall(r"(?:^\|.*\n)+", markdown, re.M):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1, block
@@ -257,8 +253,9 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     words = ["experiment=tables/ablations", "seed=0,1", "data.names=[a]"]
     (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": words}}}))
     out = sweep.parent / "results"
-    assert cli.main(["report", str(sweep), "--results", str(out), "--record", str(out / "sweep.json")]) == 0
-    assert "tables: file://" in (said := capsys.readouterr().out) and "record: file://" in said
+    assert cli.main(["report", str(sweep), "--out", str(out), "--no-pictures"]) == 0
+    assert cli.main(["report", str(sweep), "--record", str(out / "sweep.json")]) == 0
+    assert "record: file://" in capsys.readouterr().out
     text = (out / "results.md").read_text()
     command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
     assert r"* Without figures: no\_hierarchy/seed\_0 (failed)" in text
@@ -271,10 +268,8 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": [*words, "model=other"]}}}))
     commands = {run.command for run in find_runs([sweep / "full"])}
     assert commands == {f"gausim train seed={i} experiment=tables/ablations 'data.names=[a]'" for i in (0, 1)}
-    assert cli.main(["report", str(sweep / "no_hierarchy"), "--results", str(out)]) == 2
+    assert cli.main(["report", str(sweep / "no_hierarchy"), "--record", str(out / "none.json")]) == 2
     assert "no run here is evaluated" in capsys.readouterr().err
-    assert cli.main(["report", "--results", str(out)]) == 2
-    assert "DIR: expected run directories" in capsys.readouterr().err
 
 
 def check_latex(text: str) -> None:

@@ -55,18 +55,15 @@ def test_a_finished_run_is_refused_and_overwriting_keeps_foreign_files(tmp_path:
 
 def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path)
-    with pytest.raises(ZeroDivisionError), run.recording_failure():
-        1 / 0  # noqa: B018
-    assert not run.has_failed  # nothing was begun
     run.prepare(CONFIG)
-    with pytest.raises(ZeroDivisionError), run.recording_failure():
+    with pytest.raises(ZeroDivisionError), run.recording_failure(tmp_path.parent):
         1 / 0  # noqa: B018
     assert run.has_failed and run.failure() == "ZeroDivisionError: division by zero"
     assert "Traceback" in (tmp_path / "FAILED").read_text()
-    with pytest.raises(RunError), run.recording_failure():
+    with pytest.raises(RunError), run.recording_failure(tmp_path.parent):
         raise RunError("two\nlines")
     assert run.failure() == "RunError: two lines" and "Traceback" not in (tmp_path / "FAILED").read_text()
-    with pytest.raises(KeyboardInterrupt), run.recording_failure():
+    with pytest.raises(KeyboardInterrupt), run.recording_failure(tmp_path.parent):
         run.prepare(CONFIG)
         raise KeyboardInterrupt
     assert not run.has_failed
@@ -74,24 +71,12 @@ def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Pa
     assert events == ["started", "failed", "failed", "started"]
 
 
-def test_what_a_finished_run_says_is_checked(tmp_path: Path) -> None:
-    run = RunDirectory(tmp_path)
-    with pytest.raises(RunError, match="FINISHED"):
-        run.facts()
-    run.finish({"epochs": 3, "last_epoch": {"steps": 2.0}})
-    assert run.facts() == {"epochs": 3, "last_epoch": {"steps": 2.0}}
-    for wrong in ("[]", '{"epochs": 3}', "{"):
-        (tmp_path / "FINISHED").write_text(wrong)
-        with pytest.raises(RunError, match="FINISHED: expected facts of a finished run"):
-            run.facts()
-
-
 @pytest.mark.parametrize("stepped", [False, True])
 def test_a_new_run_that_fails_before_its_first_step_leaves_nothing(tmp_path: Path, stepped: bool) -> None:
     run = RunDirectory(tmp_path / "out" / "name" / "seed_0")
     (run.path / ".hydra").mkdir(parents=True)
     (run.path / ".hydra" / "config.yaml").write_text("")
-    with pytest.raises(ZeroDivisionError), run.leaving_no_trace(tmp_path / "out"), run.recording_failure():
+    with pytest.raises(ZeroDivisionError), run.recording_failure(tmp_path / "out"):
         run.prepare(CONFIG)
         run.has_stepped = stepped
         1 / 0  # noqa: B018
@@ -99,6 +84,6 @@ def test_a_new_run_that_fails_before_its_first_step_leaves_nothing(tmp_path: Pat
     again = RunDirectory(run.path)
     (tmp_path / "out" / "name" / "seed_0").mkdir(parents=True, exist_ok=True)
     (run.path / "notes.txt").write_text("mine")
-    with pytest.raises(ZeroDivisionError), again.leaving_no_trace(tmp_path / "out"):
+    with pytest.raises(ZeroDivisionError), again.recording_failure(tmp_path / "out"):
         1 / 0  # noqa: B018
     assert (run.path / "notes.txt").read_text() == "mine" and again.has_failed == stepped

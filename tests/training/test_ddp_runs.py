@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 import yaml
+from helpers.digests import digest
 from helpers.toy_runs import Trainings, assert_same_run, killed, rows
 
-from gausim.runs.checkpoint import digest, read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "plan.batch_size=2")
 STEP = "gausim.training.module.GausSimModule.training_step"

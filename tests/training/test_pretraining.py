@@ -16,7 +16,7 @@ from benchmarks import bodies
 from gausim.cli import evaluate, simulate, train
 from gausim.compose.build import build
 from gausim.compose.config import compose
-from gausim.compose.unfilmed import EvenMaterial, open_scene
+from gausim.compose.unfilmed import open_scene
 from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.data.pretraining import CorpusDataModule
@@ -110,7 +110,7 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(
     body = data.objects[0].scene()
     periods = {}
     for stiffness in (1.0, 4.0):
-        live = open_scene(body, fps=24.0, base=base, material=EvenMaterial(stiffness, damping=0.1), sway=0.02)
+        live = open_scene(body, fps=24.0, base=base, stiffness=stiffness, damping=0.1, sway=0.02)
         tip = [float(live.step().positions[8, 0]) for _ in range(25 // int(stiffness**0.5))]
         periods[stiffness] = 4 * (1 + tip.index(max(tip)))  # frames to the first turn
     assert periods[1.0] == pytest.approx(24, abs=6) and periods[4.0] == pytest.approx(12, abs=3)
@@ -128,7 +128,7 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(
         replay_session(open_scene(body, fps=24.0, base=base, sway=0.02), live.session()).positions[-1], last
     )
     assert torch.equal(replay_session(live, live.session()).positions[-1], last)  # which begins with the first material
-    alone = [open_scene(body, fps=24.0, material=given, sway=0.02) for given in (None, EvenMaterial(4.0))]
+    alone = [open_scene(body, fps=24.0, stiffness=given, sway=0.02) for given in (None, 4.0)]
     assert not torch.equal(*(live.step().positions for live in alone))  # the template without a network has one, too
 
     scene, out = tmp_path / "beam.ply", tmp_path / "out"

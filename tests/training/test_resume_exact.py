@@ -10,7 +10,7 @@ from helpers.toy_runs import Trainings, assert_same_run, killed, learned, rows
 
 from gausim.runs.checkpoint import read_checkpoint
 
-SAVED = "gausim.runs.checkpoint._check_written"
+SAVED = "gausim.runs.checkpoint.read_checkpoint"
 STEP = "gausim.training.module.GausSimModule.training_step"
 THREE = ("trainer=cpu", "plan.epochs=3")
 

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted, Recorded
-from gausim.core import FittedState
+from gausim.baselines.fitted import Fitted, FittedState, Recorded
 from gausim.nn.mlp import zero_output
 from gausim.nn.planes import Planes
 from gausim.ops.rotation import quaternion_to_matrix

@@ -13,10 +13,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
+from gausim.baselines.fitted import Fitted, FittedDynamics
 from gausim.baselines.stages import FitPlan, Stage
-from gausim.core import DivergenceError, FittedDynamics, FittedMethod, Renderer, SimState
-
-from gausim.core import Trajectory  # isort: skip
+from gausim.core import ConfigError, DivergenceError, Renderer, SimState, Trajectory
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceSample
 from gausim.data.sampler import SequenceBatchSampler
@@ -31,6 +30,7 @@ from gausim.training.rollout import States, check_reach, describe, reach
 from gausim.training.statistics import SequenceBaseline, relative
 from gausim.training.supervision.images import ImageSupervision
 from gausim.training.table import Table, short
+from gausim.training.trainer import TrainerSettings
 
 COLUMNS = (
     "epoch", "step", "stage", "steps", "loss_image", "ratio_static", "excess_static", "ratio_first", "motion_energy",
@@ -61,16 +61,17 @@ class FittedModule(nn.Module):
 
     initial_states = None
 
-    def __init__(self, model: FittedMethod, plan: FitPlan, *, renderer: Renderer, explosion: float) -> None:
+    def __init__(self, model: Fitted, plan: FitPlan, *, renderer: Renderer, explosion: float) -> None:
         """A rollout ends where a kernel is further than ``explosion`` from rest [diagonals of the scene]."""
         super().__init__()
         penalties = sorted(model.penalties(0)) if any(s.penalties for _, s in plan.order) else []
         plan.check(model.parameter_groups(), penalties)
-        self.model, self.plan = cast(Any, model), plan
+        self.model, self.plan = model, plan
         self.method_name, self.scenes = model.name, model.scenes
         self.renderer, self.explosion = renderer, explosion
         self.images = ImageSupervision(model.scenes, renderer, ImageLoss())
         self.images.begins = self._begins
+        self.global_step = 0  # optimiser steps so far
         self.made, self.cost = dict.fromkeys((name for name, _ in plan.order), 0.0), TrainingCost()
 
     @property
@@ -159,7 +160,7 @@ class FittedModule(nn.Module):
     def _begins(self, sample: SequenceSample) -> Float[Tensor, "K 3"] | None:
         if not self.scenes[sample.scene_id].surroundings.free:
             return None
-        return cast(Tensor, self.model.begin(sample.sequence_id).positions.detach())
+        return self.model.begin(sample.sequence_id).positions.detach()
 
 
 class Fit:
@@ -173,7 +174,7 @@ class Fit:
         groups = [{"params": own, "lr": 0.0, "name": name} for name, own in module.groups().items() if own]
         self.optimizer: Optimizer = (self.stages.optimizer or Adam)(groups)
         self.sampler = SequenceBatchSampler(len(data.index), plan=plan, seed=seed)
-        self.epoch = self.batch = self.step = 0
+        self.epoch = self.batch = 0
         self.position, self.stage = 0.0, ""
         self.sums: list[Any] = []  # frames, change and steps of the sequences of this epoch
         self.baselines: dict[int, SequenceBaseline] = {}
@@ -191,8 +192,8 @@ class Fit:
             self.position = max(self.position + 1, done * self.stages.epochs)
             self.epoch, self.batch, self.sums = self.epoch + 1, 0, []
             seconds = time.monotonic() - began
-            row = {"epoch": self.epoch, "step": self.step, "stage": self.stage, "seconds": seconds, **self.summary}
-            table.append({name: short(value) for name, value in row.items()})
+            place = {"epoch": self.epoch, "step": self.module.global_step, "stage": self.stage, "seconds": seconds}
+            table.append({name: short(value) for name, value in (place | self.summary).items()})
             said = f"T {self.summary['steps']:.0f}  loss/static {self.summary.get('excess_static', float('nan')):.3f}"
             print(f"epoch {self.epoch}  stage {self.stage}  {said}  {seconds:.1f} s", flush=True)
             self.save()
@@ -214,7 +215,7 @@ class Fit:
         while self.batch < len(batches):
             rate = self._rates(stage, begun + self.batch / len(batches) * self.stages.shows)
             self._step(stage, [self.data.index[SampleKey(i, steps)] for i in batches[self.batch]])
-            self.batch, self.step = self.batch + 1, self.step + 1
+            self.batch, self.module.global_step = self.batch + 1, self.module.global_step + 1
             self.module.made[name] += self.stages.shows / len(batches)
             self.summary = {"steps": float(steps), "lr": rate, **self._means(steps)}
             if self.plan.time_fraction(self.minutes) >= 1:
@@ -268,13 +269,13 @@ class Fit:
 
     def save(self) -> None:
         """Writes ``last.ckpt``, from which the fit continues exactly."""
-        own = {name: getattr(self, name) for name in ("epoch", "batch", "step", "position", "stage", "sums", "summary")}
+        own = {name: getattr(self, name) for name in ("epoch", "batch", "position", "stage", "sums", "summary")}
         known = {sequence: asdict(baseline) for sequence, baseline in self.baselines.items()}
         checkpoint = {
             "state_dict": self.module.state_dict(),
             "optimizer_states": [self.optimizer.state_dict()],
             "epoch": self.epoch,
-            "global_step": self.step,
+            "global_step": self.module.global_step,
             "cost": self.module.cost.state_dict(),
             "gausim": {
                 "scenes": fingerprints(self.module.scenes),
@@ -297,27 +298,50 @@ class Fit:
         self.module.take_notes(checkpoint)
         self.baselines = {int(i): SequenceBaseline(**known) for i, known in own.pop("baselines").items()}
         own.pop("made")
+        self.module.global_step = checkpoint["global_step"]
         for name, value in own.items():
             setattr(self, name, value)
 
 
+def begin(module: FittedModule, data: ReadyDataModule, config: Mapping[str, Any], *, resumed: bool) -> None:
+    """Refuses to start from another run."""
+    if config["init_from"] is not None or config["freeze"] is not None:
+        raise ConfigError(
+            f"init_from, freeze: {module.method_name} is fitted to its own sequences and takes nothing over. Leave "
+            "both null, and train on the new sequences."
+        )
+
+
+def course(module: FittedModule, data: ReadyDataModule, config: Mapping[str, Any]) -> list[str]:
+    """Stages of the fit, and notes on the method."""
+    lines = [f"{name}: {stage.iterations} iterations per sequence" for name, stage in module.plan.order]
+    return [*lines, *(f"note: {note}" for note in module.model.notes())]
+
+
 def fit(
-    module: FittedModule, data: ReadyDataModule, plan: TrainingPlan, run_dir: Path, *, seed: int, resume: Path | None
-) -> dict[str, Any]:
-    """Fits a method, or goes on from a checkpoint; returns facts about the fit.
+    module: FittedModule, data: ReadyDataModule, settings: TrainerSettings, run_dir: Path, *, seed: int,
+    resume: Path | None, loggers: Sequence[Any],
+) -> dict[str, Any]:  # fmt: skip
+    """Fits a method on one rank, or goes on from a checkpoint; returns facts about the fit. Nothing is logged.
 
     Raises:
+        ConfigError: there are several ranks.
         RunError: the checkpoint does not fit.
         DivergenceError: a value is not finite.
     """
+    if settings.size != 1:
+        raise ConfigError(f"trainer.devices: {module.method_name} is fitted by one rank; expected 1.")
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
+    module.to("cuda" if settings.on_gpu else "cpu")
     if not module.plan.order:  # nothing is learned
         checkpoint = {"state_dict": module.state_dict(), "gausim": {"scenes": fingerprints(module.scenes),
                       "fit": {"made": {}}}, "cost": module.cost.summary(), "epoch": 0, "global_step": 0}  # fmt: skip
         AtomicCheckpointIO().save_checkpoint(checkpoint, run_dir / LAST_CHECKPOINT)
         return {"epochs": 0, "optimizer_steps": 0, "last_epoch": {}, "notes": module.notes()}
-    loop = Fit(module, data, plan, run_dir, seed)
+    loop = Fit(module, data, cast(TrainingPlan, data.plan), run_dir, seed)
     if resume is not None:
         loop.resume(resume)
     loop.run()
-    figures = {"epochs": loop.epoch, "optimizer_steps": loop.step, "last_epoch": loop.summary}
+    figures = {"epochs": loop.epoch, "optimizer_steps": module.global_step, "last_epoch": loop.summary}
     return {**figures, "notes": module.notes()}

@@ -8,74 +8,50 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gausim.core import Forces, GaussianScene, HandPath, SimState, Trajectory
+from gausim.core import GaussianScene, HandPath, SimState, Trajectory
 from gausim.core.surroundings import best_rotation
 from gausim.ops.rotation import rotation_of, rotation_vector
 
 
-class StaticDynamics:
-    """The rest state in every frame, for any initial state and forces.
-
-    Args:
-        scene: the rest scene.
-        fps: frames per second of the trajectory.
-    """
-
-    def __init__(self, scene: GaussianScene, *, fps: float) -> None:
-        self.rest: Tensor = scene.means
-        self.fps = fps
-
-    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """``steps`` + 1 identical frames of the rest state (memory of one frame)."""
-        frames = steps + 1
-        identity = torch.eye(3).to(self.rest).expand(frames, 1, 3, 3)
-        one_unit = torch.zeros(len(self.rest), dtype=torch.long, device=self.rest.device)
-        return Trajectory(self.rest.expand(frames, -1, -1), identity, identity, one_unit, self.fps)
+def static_motion(scene: GaussianScene, *, fps: float, steps: int) -> Trajectory:
+    """The rest state in ``steps`` + 1 frames (memory of one frame)."""
+    rest, frames = scene.means, steps + 1
+    identity = torch.eye(3).to(rest).expand(frames, 1, 3, 3)
+    one_unit = torch.zeros(len(rest), dtype=torch.long, device=rest.device)
+    return Trajectory(rest.expand(frames, -1, -1), identity, identity, one_unit, fps)
 
 
-class BallisticDynamics:
+def ballistic_motion(scene: GaussianScene, initial: SimState, *, fps: float, steps: int) -> Trajectory:
     """The rest shape in rigid flight: constant spin, constant velocity under gravity, no bounce.
 
-    Position and orientation in the two given frames are the best rigid fit of the rest shape (Kabsch). Where its lowest
-    kernel meets the floor from above, the body stops for good.
-
-    Args:
-        scene: the rest scene with its surroundings; gravity that is trained counts as its initial value.
-        fps: frames per second of the trajectory.
+    Position and orientation in the two given frames are the best rigid fit of the rest shape (Kabsch); the later one is
+    the first of ``steps`` + 1 frames. Where its lowest kernel meets the floor from above, the body stops for good.
+    Gravity that is trained counts as its initial value.
     """
-
-    def __init__(self, scene: GaussianScene, *, fps: float) -> None:
-        self.rest: Tensor = scene.means
-        self.surroundings, self.fps = scene.surroundings, fps
-        self._solid = scene.simulated
-
-    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """``steps`` + 1 frames, the rigid fit to ``initial`` first; forces are ignored."""
-        own, floor = self._solid, self.surroundings.floor
-        rotation, centre = rigid_fit(self.rest[own], initial.positions[own])
-        before, centre_before = rigid_fit(self.rest[own], initial.previous[own])
-        offset = self.rest.double() - self.rest[own].double().mean(0)
-        spin = rotation @ before.mT
-        pull = torch.tensor(self.surroundings.gravity or (0.0, 0.0, 0.0)).to(centre) / self.fps**2
-        move = centre - centre_before
-        rotations, positions = [rotation], [centre + offset @ rotation.mT]
-        for _ in range(steps):
-            # Verlet's step, exact in uniform gravity.
-            move = move + pull
-            rotation, centre = spin @ rotation, centre + move
-            if floor is not None:
-                up = centre.new_tensor(floor.normal)
-                depth = -float(floor.height(centre + offset[own] @ rotation.mT).min())
-                if depth > 0 and float(move @ up) < 0:  # what rises may leave it
-                    centre, move = centre + depth * up, torch.zeros_like(move)
-                    spin, pull = torch.eye(3).to(spin), torch.zeros_like(pull)
-            rotations.append(rotation)
-            positions.append(centre + offset @ rotation.mT)
-        turned = torch.stack(rotations)[:, None].to(self.rest)
-        # The last unit is for kernels that never move.
-        turned = torch.cat((turned, torch.eye(3).to(turned).expand_as(turned)), 1)
-        moved = torch.where(own[:, None], torch.stack(positions).to(self.rest), self.rest)
-        return Trajectory(moved, turned, turned, (~own).long(), self.fps)
+    rest, own, around = scene.means, scene.simulated, scene.surroundings
+    rotation, centre = rigid_fit(rest[own], initial.positions[own])
+    before, centre_before = rigid_fit(rest[own], initial.previous[own])
+    offset, spin = rest.double() - rest[own].double().mean(0), rotation @ before.mT
+    pull = torch.tensor(around.gravity or (0.0, 0.0, 0.0)).to(centre) / fps**2
+    move = centre - centre_before
+    rotations, positions = [rotation], [centre + offset @ rotation.mT]
+    for _ in range(steps):
+        # Verlet's step, exact in uniform gravity.
+        move = move + pull
+        rotation, centre = spin @ rotation, centre + move
+        if around.floor is not None:
+            up = centre.new_tensor(around.floor.normal)
+            depth = -float(around.floor.height(centre + offset[own] @ rotation.mT).min())
+            if depth > 0 and float(move @ up) < 0:  # what rises may leave it
+                centre, move = centre + depth * up, torch.zeros_like(move)
+                spin, pull = torch.eye(3).to(spin), torch.zeros_like(pull)
+        rotations.append(rotation)
+        positions.append(centre + offset @ rotation.mT)
+    turned = torch.stack(rotations)[:, None].to(rest)
+    # The last unit is for kernels that never move.
+    turned = torch.cat((turned, torch.eye(3).to(turned).expand_as(turned)), 1)
+    moved = torch.where(own[:, None], torch.stack(positions).to(rest), rest)
+    return Trajectory(moved, turned, turned, (~own).long(), fps)
 
 
 def rigid_fit(rest: Float[Tensor, "P 3"], moved: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
@@ -84,42 +60,29 @@ def rigid_fit(rest: Float[Tensor, "P 3"], moved: Float[Tensor, "P 3"]) -> tuple[
     return best_rotation(moved.double() - centre, offset), centre
 
 
-class FollowHandsDynamics:
+def hands_motion(scene: GaussianScene, hands: HandPath, *, fps: float, steps: int) -> Trajectory:
     """Kernels move by the mean of the hands' motions, weighted by the inverse distance w_g to what each hand holds.
 
     With hand g at c_g, turned by exp(theta_g) about o_g, kernel X goes to
     X + sum_g w_g (c_g - o_g + (exp(w_g theta_g) - I) (X - o_g)): exactly with its hand where it is held, and between
     two hands as far apart as a beam is long, along the beam's static deflection by turned ends. Pins that no hand moves
-    count as a hand that stands still.
-
-    Args:
-        scene: the rest scene; its field ``hand`` tells what each hand holds.
-        hands: recorded path of the hands.
-        fps: frames per second of the trajectory.
+    count as a hand that stands still. The result has ``steps`` + 1 frames, from frame 0 of the hands on.
     """
-
-    def __init__(self, scene: GaussianScene, hands: HandPath, *, fps: float) -> None:
-        self.rest: Tensor = scene.means
-        self.hands, self.fps = hands, fps
-        self.weights = hand_weights(scene)
-
-    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """``steps`` + 1 frames from frame 0 of the hands on; ``initial`` and forces are ignored."""
-        rest, positions, rotations = self.rest, [], []
-        for frame in range(steps + 1):
-            pose = self.hands.pose(frame).to(rest)
-            moved, turn = rest, torch.zeros_like(rest)
-            for number, weight in enumerate(self.weights.unbind(1)):
-                theta = weight[:, None] * rotation_vector(pose.rotations[number])
-                offset = rest - pose.origins[number]
-                turned = (rotation_of(theta) @ offset[..., None])[..., 0] - offset
-                moved = moved + weight[:, None] * (pose.centres[number] - pose.origins[number] + turned)
-                turn = turn + theta
-            positions.append(moved)
-            rotations.append(rotation_of(turn))
-        turned = torch.stack(rotations)
-        units = torch.arange(len(rest), device=rest.device)
-        return Trajectory(torch.stack(positions), turned, turned, units, self.fps)
+    rest, positions, rotations = scene.means, [], []
+    weights = hand_weights(scene)
+    for frame in range(steps + 1):
+        pose = hands.pose(frame).to(rest)
+        moved, turn = rest, torch.zeros_like(rest)
+        for number, weight in enumerate(weights.unbind(1)):
+            theta = weight[:, None] * rotation_vector(pose.rotations[number])
+            offset = rest - pose.origins[number]
+            turned = (rotation_of(theta) @ offset[..., None])[..., 0] - offset
+            moved = moved + weight[:, None] * (pose.centres[number] - pose.origins[number] + turned)
+            turn = turn + theta
+        positions.append(moved)
+        rotations.append(rotation_of(turn))
+    turns, units = torch.stack(rotations), torch.arange(len(rest), device=rest.device)
+    return Trajectory(torch.stack(positions), turns, turns, units, fps)
 
 
 def hand_weights(scene: GaussianScene) -> Float[Tensor, "K G"]:

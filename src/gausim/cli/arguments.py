@@ -109,15 +109,10 @@ def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options:
     Raises:
         ConfigError: a number is not positive.
     """
-    from gausim.compose.unfilmed import EvenMaterial, open_scene
+    from gausim.compose.unfilmed import open_scene
 
-    given = {"stiffness": arguments.stiffness, "damping": arguments.damping}
-    material = {name: value for name, value in given.items() if value is not None}
-    even = EvenMaterial(**material) if material else None
-    return open_scene(
-        scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=even, device=arguments.device,
-        **options,
-    )  # fmt: skip
+    names = ("fps", "base", "seed", "stiffness", "damping", "device")
+    return open_scene(scene, **{name: getattr(arguments, name) for name in names}, **options)
 
 
 def positive(text: str) -> int:

@@ -21,7 +21,9 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("evaluate", " Writes metrics.json, metrics.npz, table.md and an error plot per object.")
+    parser = command_parser(
+        "evaluate", " Writes metrics.json, metrics.npz, table.md, and a film and an error plot per object."
+    )
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add_names(parser, "objects", "measure these objects (default: all)")

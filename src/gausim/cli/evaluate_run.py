@@ -14,13 +14,13 @@ from rich.markdown import Markdown
 from gausim.cli.output import end, named_bar
 from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
 from gausim.compose.data_paths import data_option
-from gausim.compose.predict import TrainedPrediction, endurance, run_objects, scene_of, sequence_of, state_of
+from gausim.compose.predict import endurance, run_objects, state_of
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.metrics import FLIP
-from gausim.pictures.figures import diagnosis_figure, endurance_figure, error_figure
+from gausim.pictures.figures import endurance_figure, error_figure
 from gausim.report.verdict import first_sentences
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
@@ -28,7 +28,7 @@ from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
 from gausim.runs.provenance import code_provenance
 
-WRITTEN = ("metrics.json", "metrics.npz", "pictures.npz", "table.md")
+WRITTEN = ("metrics.json", "metrics.npz", "table.md")
 
 
 def evaluate(arguments: argparse.Namespace) -> int:
@@ -46,17 +46,15 @@ def evaluate(arguments: argparse.Namespace) -> int:
         run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     elif part:
         facts |= {"part": part}
-    results = _evaluate(run, arguments, sequences)
     whole = _home(run.run_dir, part)
     partial = arguments.objects or arguments.sequences or arguments.cameras != "all"  # never overwrites the whole
     folder = arguments.out or (whole / "partial" if partial else whole)
+    results = _evaluate(run, arguments, sequences, folder)
     written = write_evaluation(folder, results, facts)
     drawn: list[str] = []
     for curves in results:
-        name = curves.facts.name
-        error_figure(curves, folder / f"errors_{name}.png")
-        shown = diagnosis_figure(name, written.objects[name], folder / f"motion_{name}.png")
-        drawn += [f"errors_{name}.png", *([f"motion_{name}.png"] if shown else [])]
+        error_figure(curves, folder / f"errors_{curves.name}.png")
+        drawn += [f"film_{curves.name}.mp4", f"errors_{curves.name}.png"]
     if arguments.endurance is not None:
         drawn += _endure(run, arguments, folder)
     if arguments.json:
@@ -103,19 +101,22 @@ def _pretrained(run: Path, trainable: int) -> int | None:
     return trainable if bodies is None else int(bodies)
 
 
-def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str, list[str]]) -> list[ObjectCurves]:
+def _evaluate(
+    run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str, list[str]], folder: Path
+) -> list[ObjectCurves]:
     items = run_objects(run, list(sequences))
     with named_bar(sum(map(len, sequences.values())), "evaluate") as advance:
         return [
             evaluate_object(
                 item.data,
-                scene_of(run, item),
-                {run.module.method_name: TrainedPrediction(run, item)},
+                item.scene,
+                {run.module.method_name: item},
                 run.renderer,
                 sequences=sequences[item.data.name],
                 views=_views(item.data, arguments.cameras),
                 flip=arguments.flip,
                 advance=advance,
+                films=folder,
             )
             for item in items
         ]
@@ -123,7 +124,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace, sequences: dict[str
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
     """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
-    found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.objects)}
+    found = {item.data.name: endurance(item, arguments.endurance) for item in run_objects(run, arguments.objects)}
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
     for name, rollouts in found.items():
         endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
@@ -154,7 +155,7 @@ def _choose(run: LoadedRun, arguments: argparse.Namespace) -> tuple[str | None, 
     found = {}
     for item in items:
         names = arguments.sequences or [record.name for record in item.data.sequences]
-        own = [sequence_of(item, name).name for name in names]
+        own = [item.sequence(name).name for name in names]
         fitting = [name for name in own if (name in item.data.test_part) == arguments.test]
         if arguments.sequences and len(fitting) < len(own):
             other = [name for name in own if name not in fitting]
@@ -187,10 +188,10 @@ def _look(
         (folder / DEVELOPMENT).mkdir(exist_ok=True)
         for file in sorted(file for file in folder.iterdir() if file.is_file()):
             file.replace(folder / DEVELOPMENT / file.name)
-    made = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=sequences)
-    again = f", look {made.looks}" if made.looks > 1 else ""
+    looks = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=sequences)
+    again = f", look {looks}" if looks > 1 else ""
     print(f"test part: {trials} trials declared{again}; recorded in {path}")
-    return {"part": TEST_PART, "trials": trials, "looks": made.looks}
+    return {"part": TEST_PART, "trials": trials, "looks": looks}
 
 
 def _home(run_dir: Path, part: str | None) -> Path:

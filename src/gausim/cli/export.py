@@ -88,17 +88,16 @@ def _page(arguments: argparse.Namespace) -> int:
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
     from gausim.compose.page import elastic_page
-    from gausim.compose.predict import run_objects, scene_of, state_of
+    from gausim.compose.predict import run_object, state_of
     from gausim.io.page import save_page
 
     run = load_run(arguments.source, data=data_option(arguments.data), device="cpu")
     state_of(run)
-    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
+    item = run_object(run, arguments.objects)
     page, share = elastic_page(run, item)
     path = arguments.out or Path(f"{item.data.name}.html")
-    motion = Motion(
-        item.data.name, page.fps, 0, lambda: iter(()), scene_of(run, item), cameras=item.data.sequences[0].cameras
-    )
+    cameras = item.data.sequences[0].cameras
+    motion = Motion(item.data.name, page.fps, 0, lambda: iter(()), item.scene, cameras=cameras)
     background = parse_background(arguments.background)
     sizes = save_page(path, page, _camera(motion, arguments), up=arguments.up, background=background)
     parts = ", ".join(f"{name} {size / 1e6:.2f}" for name, size in sizes.items())
@@ -133,14 +132,14 @@ def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
 def _from_run(arguments: argparse.Namespace) -> Motion:
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
-    from gausim.compose.predict import TrainedPrediction, run_objects, scene_of, sequence_of, state_of
+    from gausim.compose.predict import run_object, state_of
 
     run = load_run(arguments.source, data=data_option(arguments.data), device=arguments.device)
     state_of(run)
-    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
-    record = sequence_of(item, arguments.sequences or item.data.sequences[0].name)
-    trajectory = TrainedPrediction(run, item)(record, arguments.frames).to("cpu")
-    motion = _of_trajectory(f"{item.data.name}_{record.name}", scene_of(run, item), trajectory)
+    item = run_object(run, arguments.objects)
+    record = item.sequence(arguments.sequences or item.data.sequences[0].name)
+    trajectory = item(record, arguments.frames).to("cpu")
+    motion = _of_trajectory(f"{item.data.name}_{record.name}", item.scene, trajectory)
     return replace(motion, cameras=record.cameras, renderer=run.renderer, device=run.device)
 
 

@@ -10,7 +10,7 @@ import torch
 
 from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.data_paths import data_option
-from gausim.compose.predict import run_objects, scene_of, state_of
+from gausim.compose.predict import run_object, state_of
 from gausim.core import GaussianScene
 from gausim.core.errors import ConfigError
 from gausim.io.ply import save_scene
@@ -28,8 +28,8 @@ def show_material(arguments: argparse.Namespace) -> int:
     """Writes picture and PLY of a property, and prints its range; returns the exit status."""
     run, name = load_run(arguments.scene, data=data_option(arguments.data)), arguments.property
     state_of(run)
-    item = run_objects(run, None if arguments.objects is None else [arguments.objects])[0]
-    scene, found = scene_of(run, item).to("cpu"), _learned(run, item.scene_id, name, arguments.scene)
+    item = run_object(run, arguments.objects)
+    scene, found = item.scene.to("cpu"), _learned(run, item.scene_id, name, arguments.scene)
     known = torch.isfinite(found.values)
     scale = property_scale(found.values)
     colors = property_colors(found.values, scale)

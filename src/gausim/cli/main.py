@@ -28,8 +28,6 @@ COMMANDS = {
     "simulate": "Roll a run forward and write videos, figures and trajectories.",
     "view": "Simulate a run or a scene interactively in the browser.",
     "export": "Write a motion as HTML that plays it, glTF, PLY, OpenUSD, safetensors, viser, MP4 or GIF.",
-    "pack": "Pack a finished run or a data set for others: one zip archive and its SHA-256.",
-    "fetch": "Fetch a run or a data set that others published, from a file or the web.",
     "report": "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV.",
 }
 

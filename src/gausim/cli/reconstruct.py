@@ -67,12 +67,11 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
     from gausim.io.ply import save_scene
     from gausim.reconstruction.stills import measure
     from gausim.render.cpu import CpuRenderer
-    from gausim.render.reference import ReferenceRenderer
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
     name, material, cloud, below_z = _inputs(source, arguments, options)
-    renderer = CpuRenderer() if arguments.renderer == "cpu" else ReferenceRenderer()
+    renderer = CpuRenderer()
     start = time.process_time()
     scene = pinned_by(_fit(material, renderer, options, cloud, name), arguments.pin, below_z=below_z)
     seconds = time.process_time() - start
@@ -99,17 +98,10 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "--iterations",
         type=int,
         default=4000,
-        help="make so many optimiser steps, one image each (default %(default)s)",
+        metavar="N",
+        help="make N optimiser steps, one image each (default %(default)s)",
     )
-    add("--patience", type=int, default=3, metavar="N", help="stop early after N checks without a lower mean loss, "
-        "one per twentieth of the steps; 0 never (default %(default)s)")  # fmt: skip
-    add(
-        "--sh-degree",
-        type=int,
-        default=1,
-        choices=(0, 1, 2, 3),
-        help="fit spherical harmonics of this degree (default %(default)s)",
-    )
+    add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="harmonics of this degree (default %(default)s)")
     add("--anisotropy", type=float, metavar="R", help="penalise a length over width of a kernel above R (default 3, "
         "of a scene 10)")  # fmt: skip
     add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
@@ -121,17 +113,8 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "of the training views; 0 uses the stills only (with ROOT; default %(default)s)")  # fmt: skip
     add("--longest", type=int, metavar="PIXELS", help="reduce the stills of --transforms to this length of "
         "their longer side")  # fmt: skip
-    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="make this fraction of the steps, at the "
-        "beginning, on stills of --transforms at half the size (default %(default)s)")  # fmt: skip
     add("--leave-out", type=int, default=10, metavar="N", help="leave one still of --transforms in N out for "
         "evaluation (default %(default)s)")  # fmt: skip
-    add(
-        "--background",
-        default="random",
-        choices=("random", "black"),
-        help="draw this behind training images (default random)",
-    )
-    add("--renderer", default="cpu", choices=("cpu", "reference"), help="draw with this renderer (default %(default)s)")
     add_threads_option(parser)
     add("--seed", type=int, default=0, help="draw random numbers with this seed (default %(default)s)")
 
@@ -147,8 +130,6 @@ def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
         extent=arguments.extent,
         sh_degree=arguments.sh_degree,
         missing_masks=arguments.missing_masks,
-        random_background=arguments.background == "random",
-        patience=arguments.patience,
         seed=arguments.seed,
         **{**defaults, **chosen},
     )
@@ -162,9 +143,8 @@ def _inputs(
     from gausim.reconstruction.stills import gather_object, gather_stills
 
     opaque = options.extent == "scene"
-    for flag, fraction in (("--video-share", arguments.video_share), ("--coarse", arguments.coarse)):
-        if not 0 <= fraction < 1:
-            raise DataError(f"{flag}: expected a fraction in [0, 1), got {fraction}.")
+    if not 0 <= arguments.video_share < 1:
+        raise DataError(f"--video-share: expected a fraction in [0, 1), got {arguments.video_share}.")
     if arguments.leave_out < 2:
         raise DataError(f"--leave-out: expected one still in 2 or more, got {arguments.leave_out}.")
     if source.name == "dataset.json":
@@ -175,9 +155,7 @@ def _inputs(
         data = ObjectData(source.parent)
         material = gather_object(data, video_fraction=arguments.video_share)
         return data.name, material, _cloud(arguments.points), data.pinned_below_z
-    material = gather_stills(
-        source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
-    )
+    material = gather_stills(source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=0.5)
     beside = source.parent / "points.npz"
     points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
     return source.parent.name or "scene", material, _cloud(points), None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import command_parser
 from gausim.cli.output import OWN_OBJECT, end, push
-from gausim.core.errors import ConfigError, RunError
+from gausim.core.errors import RunError
 
 if TYPE_CHECKING:
     from gausim.report.write import Report
@@ -18,12 +18,8 @@ if TYPE_CHECKING:
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    if arguments.page:
-        return _write_page(arguments.page)
-    if not arguments.dirs:
-        raise ConfigError("DIR: expected run directories, sweeps, or folders of them, got none.")
-    if arguments.results or arguments.record:
-        return _write_results(arguments)
+    if arguments.record:
+        return _write_record(arguments)
     from gausim.report.write import summary_line, write_report
 
     out = arguments.out or arguments.dirs[0] / "report"
@@ -36,40 +32,26 @@ def main(argv: list[str]) -> int:
     )
     if arguments.verbose:
         print("\n".join(f"wrote {path}" for path in report.files))
-    result = [f"{best.title}: {best.sentences[0]}" for best in report.openings[:1]]
+    result = [f"{best.title}: {best.sentence}" for best in report.openings[:1]]
     end([summary_line(report.study), *result], "page", report.files[0], *_next(report))
     return 0
 
 
-def _write_page(target: Path) -> int:
-    """Writes a page from the template and the records in the folder of its name."""
-    from gausim.io.files import write_durably
-    from gausim.report.render import page
-
-    write_durably(target, page(target.with_suffix("")).encode())
-    print(f"page: {target.resolve().as_uri()}")
-    return 0
-
-
-def _write_results(arguments: argparse.Namespace) -> int:
-    """Writes the long table of runs as a record, and tables of it."""
+def _write_record(arguments: argparse.Namespace) -> int:
+    """Writes the long table of runs as a record."""
     from gausim.report.runs import find_runs
     from gausim.report.study import make_study
-    from gausim.report.write import write_tables
     from gausim.results.table import save_results
 
-    study = make_study(find_runs(arguments.dirs, skip=arguments.results), arguments.title)
+    study = make_study(find_runs(arguments.dirs), arguments.title)
     if not study.results.table:
         raise RunError(
             f"{' '.join(map(str, arguments.dirs))}: no run here is evaluated, so there is no figure. "
             "Evaluate them with `gausim evaluate RUN`."
         )
-    if arguments.results:
-        print(f"tables: {write_tables(arguments.results, study, study.notes)[0].resolve().as_uri()}")
-    if arguments.record:
-        arguments.record.parent.mkdir(parents=True, exist_ok=True)
-        save_results(arguments.record, study.results)
-        print(f"record: {arguments.record.resolve().as_uri()}")
+    arguments.record.parent.mkdir(parents=True, exist_ok=True)
+    save_results(arguments.record, study.results)
+    print(f"record: {arguments.record.resolve().as_uri()}")
     return 0
 
 
@@ -92,13 +74,10 @@ def _parser() -> argparse.ArgumentParser:
         "shown as such.",
     )
     add = parser.add_argument
-    add("dirs", metavar="DIR", type=Path, nargs="*", help="run directories, sweeps, or any folder of them")
+    add("dirs", metavar="DIR", type=Path, nargs="+", help="run directories, sweeps, or any folder of them")
     add("--out", metavar="DIR", type=Path, help="write this folder (default: report in the first DIR)")
     add("--title", default="GausSim report", help="print this heading (default: %(default)s)")
-    add("--results", metavar="OUT", type=Path, help="write only results.md and tables.tex, to this folder: all "
-        "figures with commit, command, hardware and cost")  # fmt: skip
     add("--record", metavar="FILE.json", type=Path, help="write only these figures, as a small record for pages")
-    add("--page", metavar="FILE.md", type=Path, help="make FILE.md from FILE/page.md and the records FILE/*.json")
     add("--verbose", action="store_true", help="list the files that are written")
     add("--no-pictures", action="store_true", help="leave figures and videos out (a small page, in a second)")
     return parser

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
+from PIL import Image
 from torch import Tensor
 
 from gausim.cli.arguments import opened_scene, parse_background, pinned_by
@@ -17,7 +19,7 @@ from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.config import compose, instantiate
 from gausim.compose.data_paths import data_option
 from gausim.compose.live import REST, open_interaction
-from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of, sequence_of, state_of
+from gausim.compose.predict import RunObject, run_object, run_objects, state_of
 from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.images import composite
@@ -32,8 +34,8 @@ from gausim.io.ply import load_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import write_gif, write_video
 from gausim.ops.orbit import orbit_cameras
-from gausim.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
-from gausim.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
+from gausim.pictures.figures import error_figure, picture_grid
+from gausim.pictures.frames import PANEL_HEIGHT, brighten, comparison, contact_sheet, label_bar
 from gausim.render.draw import film, to_bytes
 from gausim.report.verdict import first_sentences
 
@@ -50,33 +52,33 @@ def simulate_run(arguments: argparse.Namespace) -> int:
     if arguments.session or has_forces(arguments):
         return _simulate_forces(run, arguments, folder)
     items = run_objects(run, arguments.objects)
-    sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
+    sentences = [_simulate_object(item, arguments, folder / item.data.name) for item in items]
     first = items[0].data.name
     push_it = push(arguments.run, first if len(run.objects) > 1 else None)
     end(sentences, "videos", folder if len(items) > 1 else folder / first, ["view", arguments.run], push_it)
     return 0
 
 
-def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
+def _simulate_object(item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
     """Writes all results on an object's sequences; returns a sentence on their errors."""
     names = arguments.sequences or [item.data.sequences[0].name]
     names = [record.name for record in item.data.sequences] if names == ["all"] else names
     views = arguments.cameras or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     for name in names:
-        sequence_of(item, name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
-    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
+        item.sequence(name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
+    run, item.least_frames = item.run, arguments.frames or 0
     with named_bar(len(names) * (1 + len(views)), f"simulate {item.data.name}") as advance:
         curves = evaluate_object(
-            item.data, scene_of(run, item), {run.module.method_name: predict}, run.renderer, sequences=names,
+            item.data, item.scene, {run.module.method_name: item}, run.renderer, sequences=names,
             advance=advance,
         )  # fmt: skip
         for name in names:
-            record = item.data.record(sequence_of(item, name).name)
-            trajectory = predict(record, arguments.frames)
+            record = item.data.record(name)
+            trajectory = item(record, arguments.frames)
             error_figure(curves, folder / name / "errors.png", sequence=name)
-            _write_trajectory(run, item, name, trajectory, folder / name)
+            _write_trajectory(item, name, trajectory, folder / name)
             for view in views:
-                _write_view(run, item, record, trajectory, view, arguments, folder / name)
+                _write_view(item, record, trajectory, view, arguments, folder / name)
                 advance(f"{name} {view}")
     for name in names:
         _list(folder / name, arguments)
@@ -86,7 +88,6 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
 
 
 def _write_view(
-    run: LoadedRun,
     item: RunObject,
     record: SequenceRecord,
     trajectory: Trajectory,
@@ -94,22 +95,16 @@ def _write_view(
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    background, scene = parse_background(arguments.background), scene_of(run, item)
+    background, scene = parse_background(arguments.background), item.scene
     drawn = film(
-        run.renderer, scene, trajectory, record.cameras_of([view]), background=background, mask=scene.foreground
+        item.run.renderer, scene, trajectory, record.cameras_of([view]), background=background, mask=scene.foreground
     )
     prediction = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
     truth = brighten(_truth(record, view, min(trajectory.frames, record.count), background), arguments.brighten)
     unseen, title = item.data.train_frames.stop, f"{item.data.name} {record.name} {view}"
-    fps, timeline = item.data.fps / arguments.slow, Timeline(trajectory.frames, unseen)
-
-    def compared() -> Iterator[np.ndarray]:
-        for number, image in enumerate(prediction):
-            yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)
-
-    _write_videos(folder / view, compared, fps, arguments)
-    slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
-    contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
+    compared = partial(comparison, truth, prediction, title, unseen)
+    _write_videos(folder / view, compared, item.data.fps / arguments.slow, arguments)
+    Image.fromarray(contact_sheet(truth, prediction, unseen)).save(folder / f"{view}_sheet.png")
 
 
 def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | None) -> np.ndarray:
@@ -136,7 +131,7 @@ def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -
     arrows: list[list[Arrow]] = []
     trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
     folder = out / item.data.name / (Path(arguments.session).stem if arguments.session else "forces")
-    _write_trajectory(run, item, session.made_with.initial, trajectory, folder)
+    _write_trajectory(item, session.made_with.initial, trajectory, folder)
     save_session(session, folder / "session.json")
     for view in views:
         cameras = _sharp(item.data.sequences[0].cameras_of([view]))
@@ -194,7 +189,7 @@ def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession |
     names = arguments.objects
     if names is None and found and found.made_with.scene in [item.data.name for item in run_objects(run)]:
         names = [found.made_with.scene]
-    item = run_objects(run, names)[0]
+    item = run_object(run, names[0] if names else None)
     start = arguments.sequences[0] if arguments.sequences else (found.made_with.initial if found else REST)
     return item, open_interaction(
         run, name=item.data.name, sequence=start, gravity=STANDARD_GRAVITY * arguments.metre,
@@ -223,8 +218,8 @@ def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Na
     return replace(found, steps=steps, entries=tuple(e for e in found.entries if e.at <= steps))
 
 
-def _write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
-    facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
+def _write_trajectory(item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
+    facts = {"object": item.data.name, "sequence": sequence, "run": item.run.run_dir.name}
     save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
 
 

@@ -27,11 +27,26 @@ again, it resumes from its last checkpoint; once finished it is refused, unless 
 started again leaves out what is finished, resumes what is not, and tries again what failed if retry_failed=true."""
 
 
-def train(cfg: DictConfig) -> float | None:
-    """One job of Hydra, which loads torch only when it begins; see :func:`gausim.cli.training_run.train`."""
-    from gausim.cli.training_run import train
+def train(cfg: DictConfig) -> object:
+    """One job of Hydra, which loads torch only when it begins; in a sweep returns what became of it.
 
-    return train(cfg)
+    In a sweep errors do not stop the other jobs: they are logged and repeated in the summary at the end.
+
+    Raises:
+        GausSimError: the run is finished, has another configuration, is damaged or in use, or training diverged.
+    """
+    from gausim.cli.sweeps.jobs import do_job
+    from gausim.cli.training_run import train_run
+    from gausim.compose.command import run_dir
+    from gausim.compose.root import in_sweep
+    from gausim.runs.directory import RunDirectory
+
+    run = RunDirectory(run_dir())
+    if in_sweep():
+        return do_job(cfg, run, train_run)
+    with run.writing():
+        train_run(cfg, run)
+    return None
 
 
 def main(argv: Sequence[str]) -> int:

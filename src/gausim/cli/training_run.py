@@ -12,59 +12,29 @@ import torch
 from omegaconf import DictConfig
 
 from gausim.cli.output import end
-from gausim.cli.sweeps.jobs import do_job
-from gausim.compose.build import is_pretrained, open_data, with_resolved_plan
-from gausim.compose.command import run_dir
+from gausim.compose.build import opened
 from gausim.compose.root import in_sweep
-from gausim.compose.targets import check_seed
-from gausim.compose.train import is_first, plain
-from gausim.compose.train import train as train_run_directory
+from gausim.compose.train import is_first, plain, train
 from gausim.core import RunError
+from gausim.data.datamodule import ReadyDataModule
 from gausim.doctor.examine import examine
 from gausim.doctor.text import findings_text
 from gausim.runs.directory import RunDirectory
 
 
-def train(cfg: DictConfig) -> float | None:
-    """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
-
-    In a sweep errors do not stop the other jobs: they are logged and repeated in the summary at the end.
-
-    Raises:
-        GausSimError: the run is finished, has another configuration, is damaged or in use, or training diverged.
-    """
-    run = RunDirectory(run_dir())
-    if in_sweep():
-        return do_job(cfg, run, train_run)
-    with run.writing():
-        return train_run(cfg, run)
-
-
-def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
+def train_run(cfg: DictConfig, run: RunDirectory) -> None:
     """Trains into a run directory locked by this process, and evaluates the run if configured."""
-    check_seed(cfg.seed)
-    with run.leaving_no_trace(Path(cfg.output_root)):
-        cfg = with_resolved_plan(cfg)
-        if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(plain(cfg)):
-            facts = run.facts()
-        else:
-            facts = _trained(cfg, run)
+    with run.recording_failure(Path(cfg.output_root)):
+        job = opened(cfg)
+        if not cfg.evaluate or cfg.overwrite or not run.awaits_evaluation(plain(job.config)):
+            faults = _warn_of_data(job.data) if cfg.doctor and not in_sweep() and is_first() else []
+            facts = train(job, run, notes={"data_faults": faults} if faults else {})
+            if is_first():
+                evaluable = not cfg.evaluate and job.data.has_videos
+                commands = [["evaluate", run.path], ["report", run.path]] if evaluable else []
+                end(_result(facts), "run", run.path, *commands)
     if cfg.evaluate:
         _evaluate(run)
-    return dict(facts.get("last_epoch", {})).get("excess_static")
-
-
-def _trained(cfg: DictConfig, run: RunDirectory) -> dict[str, Any]:
-    """Trains the run and prints its result; returns its facts."""
-    faults = _warn_of_data(cfg) if cfg.doctor and not in_sweep() and is_first() else []
-    facts = train_run_directory(cfg, run)
-    if is_first():
-        if faults:
-            facts["data_faults"] = faults
-            run.finish(facts)
-        commands = [] if cfg.evaluate or is_pretrained(run.path) else [["evaluate", run.path], ["report", run.path]]
-        end(_result(facts), "run", run.path, *commands)
-    return facts
 
 
 def _evaluate(run: RunDirectory) -> None:
@@ -100,10 +70,10 @@ def _result(facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _warn_of_data(cfg: DictConfig) -> list[str]:
+def _warn_of_data(data: ReadyDataModule) -> list[str]:
     """Prints faults and warnings of `gausim doctor` on the objects; returns one sentence per fault."""
     faults: list[str] = []
-    for item in open_data(cfg).objects:
+    for item in data.objects:
         found = examine(item, item.scene()).graver
         if found.findings:
             print(findings_text(str(item.root), found), flush=True)

@@ -99,7 +99,7 @@ def _subject(arguments: argparse.Namespace) -> Subject:
     sessions = arguments.sessions or (arguments.what / "sessions" if is_run else Path("sessions"))
     scene = made.interaction.scene
     untrained = "untrained: template only" if arguments.base is None else f"network of {arguments.base}"
-    method = made.run.module.method_name if made.run is not None else untrained
+    method = made.item.run.module.method_name if made.item is not None else untrained
     title = f"{scene.name}: {scene.count} kernels, {method}"
     return subject_of(made, title=title, beside=beside, up=arguments.up, sessions=sessions)
 

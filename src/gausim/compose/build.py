@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -15,6 +15,7 @@ from gausim.baselines.fitting import FittedModule
 from gausim.compose.config import instantiate
 from gausim.compose.data_paths import absolute, located
 from gausim.compose.device import find_device
+from gausim.compose.targets import check_seed
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
@@ -48,23 +49,53 @@ class LoadedRun:
     device: torch.device = torch.device("cpu")  # where the module is
 
 
-def build(
-    cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True
-) -> tuple[GausSimModule | FittedModule, ReadyDataModule]:
-    """Builds the module and the data of a training configuration.
+class Opened(NamedTuple):
+    """A training configuration and its data."""
+
+    config: DictConfig  # states what its plan leaves to the data, and absolute paths
+    data: ReadyDataModule  # with the resolved plan
+
+
+def opened(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> Opened:
+    """Opens the data of a training configuration and resolves its plan for them.
 
     ``sealed`` refuses unseen frames and the true motion of the test part.
 
     Raises:
-        GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
+        GausSimError: a node is wrong, the data are missing or damaged, or the plan does not fit them.
     """
-    config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
-    datamodule = open_data(config, sealed=sealed)
-    datamodule.plan = resolved_plan(config, datamodule)
+    config = copy.deepcopy(cfg) if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
+    check_seed(config.seed)
+    data: ReadyDataModule = instantiate(config.data, seed=int(config.seed))
+    data.sealed = sealed
+    data.plan = plan = _resolved_plan(config, data)
+    OmegaConf.set_struct(config, False)
+    config.plan = {**config.plan, **plan.settings()}
+    config.data = absolute(cast("dict[str, Any]", OmegaConf.to_container(config.data, resolve=True)))
     if "method" in config.model:
-        return _fitted(config, datamodule), datamodule
+        config.plan.repeats = plan.repeats
+    OmegaConf.set_struct(config, True)
+    return Opened(config, data)
+
+
+def build(
+    cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True
+) -> tuple[GausSimModule | FittedModule, ReadyDataModule]:
+    """The module and the data of a training configuration; ``sealed`` and errors are those of :func:`opened`."""
+    config, data = opened(cfg, sealed=sealed)
+    return build_module(config, data), data
+
+
+def build_module(config: DictConfig, data: ReadyDataModule) -> GausSimModule | FittedModule:
+    """The module of an opened configuration.
+
+    Raises:
+        GausSimError: a node is wrong, the model cannot be trained, or a rest scene is missing or damaged.
+    """
+    if "method" in config.model:
+        return _fitted(config, data)
     if "simulator" in config.model and "initial_states" in config.model:
-        return _simulator(config, datamodule), datamodule
+        return _simulator(config, data)
     raise ConfigError(
         "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, ...), or "
         f"'method' and 'plan' of one that is fitted (spring_mass, ...), got {sorted(str(k) for k in config.model)}."
@@ -89,7 +120,13 @@ def _simulator(config: DictConfig, datamodule: ReadyDataModule) -> GausSimModule
     scenes = [item.scene() for item in datamodule.objects]
     renderer, objective = instantiate(config.render), instantiate(config.loss)
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in datamodule.objects])()
-    method, node = _shared_simulator(config, model, datamodule), config.get("supervision")
+    entries, node = datamodule.index.entries, config.get("supervision")
+    scene_of_sequence = [scene_id for scene_id, _ in entries]
+    if isinstance(datamodule, CorpusDataModule):
+        method: SharedSimulator = KnownStates(model, datamodule, scene_of_sequence)
+    else:
+        states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+        method = SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
     truth, references = datamodule.index.ground_truth, method.references
     sources = Sources(scenes, truth, model.smooth_motions, renderer, objective.image, references)
     return GausSimModule(
@@ -103,15 +140,7 @@ def _simulator(config: DictConfig, datamodule: ReadyDataModule) -> GausSimModule
     )
 
 
-def open_data(config: DictConfig, *, sealed: bool = True) -> ReadyDataModule:
-    """The data module of a configuration; ``sealed`` is that of :func:`build`."""
-    datamodule: ReadyDataModule = instantiate(config.data, seed=int(config.seed))
-    datamodule.sealed = sealed
-    return datamodule
-
-
-def resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingPlan:
-    """The training plan of a configuration, resolved for its data."""
+def _resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingPlan:
     plan: TrainingPlan = instantiate(config.plan)
     trainer, count = config.trainer, datamodule.trained()[0]
     ranks = int(trainer.get("devices", 1)) * int(trainer.get("num_nodes", 1))
@@ -134,32 +163,6 @@ def _can_warm_start(config: DictConfig, datamodule: ReadyDataModule) -> bool:
         return False
     compared = str((config.get("supervision") or {}).get("_target_", "")).rpartition(".")[2]
     return compared != "PointSupervision" or all(record.hands is None for _, record in datamodule.index.entries)
-
-
-def with_resolved_plan(config: DictConfig) -> DictConfig:
-    """A training configuration that states what its plan leaves to the data, and absolute paths.
-
-    Raises:
-        GausSimError: the data are missing or damaged, or the plan does not fit them.
-    """
-    datamodule, found = open_data(config), copy.deepcopy(config)
-    plan = resolved_plan(config, datamodule)
-    OmegaConf.set_struct(found, False)
-    found.plan = {**found.plan, **plan.settings()}
-    found.data = absolute(cast("dict[str, Any]", OmegaConf.to_container(config.data, resolve=True)))
-    if "method" in config.model:
-        found.plan.repeats = plan.repeats
-    OmegaConf.set_struct(found, True)
-    return found
-
-
-def _shared_simulator(config: DictConfig, model: Any, datamodule: ReadyDataModule) -> SharedSimulator:
-    entries = datamodule.index.entries
-    scene_of_sequence = [scene_id for scene_id, _ in entries]
-    if isinstance(datamodule, CorpusDataModule):
-        return KnownStates(model, datamodule, scene_of_sequence)
-    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
-    return SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
 
 
 def load_run(

@@ -23,7 +23,7 @@ from gausim.compose.ablations import check_ablations
 from gausim.compose.config import compose
 from gausim.compose.errors import one_sentence, suggestion
 from gausim.compose.root import HYDRA_VERSION_BASE, ROOT_FILE, conf_dir, options
-from gausim.compose.targets import check_hydra, check_seed
+from gausim.compose.targets import check_hydra
 from gausim.core.errors import ConfigError, GausSimError
 
 # Values with quotes, lists, mappings and interpolations were meant as Hydra's grammar: its own message helps there.
@@ -34,10 +34,10 @@ _QUOTES = re.compile(r"^[\[{'\"]|[$]\{|['\"]$")
 class Job:
     """Callable for every job of Hydra; defined here so that unpickling it in a worker registers our resolvers."""
 
-    task: Callable[[DictConfig], float | None]
+    task: Callable[[DictConfig], object]
     error: GausSimError | None = None  # kept from Hydra, which would print all overrides before it
 
-    def __call__(self, config: DictConfig) -> float | None:
+    def __call__(self, config: DictConfig) -> object:
         """Runs the job."""
         try:
             return self.task(config)
@@ -46,7 +46,7 @@ class Job:
             return None
 
 
-def run_hydra(task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
+def run_hydra(task: Callable[[DictConfig], object], argv: Sequence[str]) -> int:
     """Runs a task under Hydra: overrides, `-m`, `--cfg job` (with `-m` of every job), and Hydra's other options.
 
     ``task`` is a function of the composed configuration. Returns the exit status.
@@ -109,9 +109,7 @@ def _check(words: Sequence[str], *, sweep: bool) -> None:
     if not jobs:
         raise ConfigError(f"{' '.join(words)}: expected at least one value of every key, so there is nothing to run.")
     for job in jobs:
-        composed = compose(job, with_hydra=True)
-        check_hydra(composed.hydra)
-        check_seed(composed.seed)
+        check_hydra(compose(job, with_hydra=True).hydra)
         check_ablations(job)
 
 

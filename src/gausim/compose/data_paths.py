@@ -9,8 +9,6 @@ from typing import Any
 from gausim.core.errors import ConfigError, DataError
 from gausim.runs.names import CONFIG
 
-# Folder in a packed run for rest scenes from outside its data set.
-SCENES = "scenes"
 _FILES = ("scene", "masks")
 
 
@@ -38,19 +36,16 @@ def data_option(words: Sequence[str]) -> dict[str, Any]:
 def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """The data configuration of a run with the paths on this machine, after replacing the keys ``given``.
 
-    A missing scene or masks file is searched in ``RUN/scenes``, a folder of packed runs. The checkpoint contains
-    fingerprints of its scenes, so that a wrong file is refused later.
+    The checkpoint contains fingerprints of its scenes, so that a wrong file is refused later.
 
     Raises:
         DataError: a path does not exist; the message names the option to set it.
     """
     merged = {**data, **given, "root": _roots(data.get("root"), given.get("root"))}
-    if isinstance(merged["root"], list):
-        merged["root"] = [
-            _placed(run_dir, entry, f"data.root[{i}]") if isinstance(entry, Mapping) else entry
-            for i, entry in enumerate(merged["root"])
-        ]
-    merged = _placed(run_dir, merged, "data")
+    for entry, field in [(merged, "data"), *((e, f"data.root[{i}]") for i, e in enumerate(listed(merged["root"])))]:
+        for key in _FILES if isinstance(entry, Mapping) else ():
+            if entry.get(key) is not None and not Path(entry[key]).is_file():
+                raise DataError(_missing(run_dir, f"{field}.{key}", entry[key], f"--data {key}=FILE", "a file"))
     for root in listed(merged["root"]):
         path = root.get("root") if isinstance(root, Mapping) else root
         if path is not None and not Path(path).is_dir():
@@ -63,23 +58,6 @@ def absolute(data: Mapping[str, Any]) -> dict[str, Any]:
     placed = {key: str(Path(data[key]).resolve()) for key in _FILES if data.get(key)}
     entries = [absolute(e) if isinstance(e, Mapping) else e and str(Path(e).resolve()) for e in listed(data["root"])]
     return {**data, **placed, "root": entries if isinstance(data["root"], list) else entries[0]}
-
-
-def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
-    """Scenes and masks outside the data set that a data configuration names, including masks beside their scene.
-
-    Raises:
-        DataError: a file does not exist.
-    """
-    data = located(run_dir, data, {})
-    entries = [entry for entry in listed(data["root"]) if isinstance(entry, Mapping)]
-    found = []
-    for entry in [data, *entries]:
-        scene, masks = entry.get("scene"), entry.get("masks")
-        beside = Path(scene).with_suffix(".masks.npz") if scene and not masks else None
-        found += [Path(path) for path in (scene, masks) if path]
-        found += [beside] if beside is not None and beside.is_file() else []
-    return found
 
 
 def listed(root: Any) -> list[Any]:
@@ -97,19 +75,6 @@ def _roots(own: Any, given: Any) -> Any:
     return [
         {**old, "root": new} if isinstance(old, Mapping) else new for old, new in zip(entries, replaced, strict=True)
     ]
-
-
-def _placed(run_dir: Path, entry: Mapping[str, Any], field: str) -> dict[str, Any]:
-    placed = dict(entry)
-    for key in _FILES:
-        path = entry.get(key)
-        if path is None or Path(path).is_file():
-            continue
-        packed = run_dir / SCENES / Path(path).name
-        if not packed.is_file():
-            raise DataError(_missing(run_dir, f"{field}.{key}", path, f"--data {key}=FILE", "a file"))
-        placed[key] = str(packed)
-    return placed
 
 
 def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> str:

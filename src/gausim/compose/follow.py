@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from omegaconf import OmegaConf
-
+from gausim.compose.build import opened
 from gausim.compose.train import train
 from gausim.core import GausSimError
 from gausim.runs.directory import RunDirectory
@@ -15,7 +14,7 @@ def main() -> int:
     """Trains as a follower, by the saved configuration of the run; returns the exit status."""
     run = RunDirectory(sys.argv[1])
     try:
-        train(OmegaConf.create(run.config()), run)
+        train(opened(run.config()), run)
     except GausSimError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

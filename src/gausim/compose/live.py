@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gausim.baselines.fitting import FittedModule
 from gausim.compose.build import LoadedRun
-from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of
-from gausim.core import ConfigError, DataError, GaussianScene, HandPath, SimState, Steppable
+from gausim.compose.predict import RunObject, run_object
+from gausim.core import ConfigError, DataError, HandPath, SimState, Steppable
 from gausim.core.state import initial_sway
 from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
@@ -46,26 +46,19 @@ def open_interaction(
         DataError: the object or sequence does not exist.
         ConfigError: the model does not support simulation.
     """
-    item = run_objects(run, None if name is None else [name])[0]
-    scene = scene_of(run, item)
-    initial, dynamics, masses, ceiling, path = _method(run, item, scene, sequence)
+    item = run_object(run, name)
+    initial, dynamics, masses, ceiling, path = _method(item, sequence)
     settings = json.dumps([run.config.get("model"), ceiling], sort_keys=True, default=str)
     name_of_run = "/".join(Path(run.run_dir).resolve().parts[-2:])  # the last folder alone is often only the seed
     made_with = MadeWith.of(
-        scene, run.module.model, initial, settings=settings, name=sequence, run=name_of_run, path=path
+        item.scene, run.module.model, initial, settings=settings, name=sequence, run=name_of_run, path=path
     )
     return Interaction(
-        scene,
-        dynamics,
-        masses,
-        initial,
-        made_with=made_with,
-        units=TrainedPrediction(run, item).units,
+        item.scene, dynamics, masses, initial, made_with=made_with, units=item.units,
         gravity=STANDARD_GRAVITY if gravity is None else gravity,
-        most_force=MOST_FORCE if most_force is None else most_force,
-        keep=keep,
+        most_force=MOST_FORCE if most_force is None else most_force, keep=keep,
         hands=None if path is None else path.pose,
-    )
+    )  # fmt: skip
 
 
 def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> float | None:
@@ -85,11 +78,10 @@ def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> 
     return ENERGY_ROOM * max(energies)
 
 
-def _method(
-    run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
-) -> tuple[SimState, Steppable, Tensor, float | None, HandPath | None]:
+def _method(item: RunObject, sequence: str) -> tuple[SimState, Steppable, Tensor, float | None, HandPath | None]:
     """Initial state, dynamics, masses, the limit of the energy, and the recorded path of the hands."""
-    module, rest = run.module, scene.means.to(run.device)
+    run, module, scene = item.run, item.run.module, item.scene
+    rest = scene.means.to(run.device)
     still = SimState(rest, rest)
     names = [record.name for record in item.data.sequences]
     if sequence != REST and sequence not in names:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gausim.compose.build import LoadedRun
 from gausim.compose.live import energy_ceiling
-from gausim.compose.predict import RunObject, scene_of
+from gausim.compose.predict import RunObject
 from gausim.core import ConfigError, GaussianScene, SimState
 from gausim.interaction.interaction import STANDARD_GRAVITY
 from gausim.interaction.pushes import exposure
@@ -32,7 +32,7 @@ def elastic_page(run: LoadedRun, item: RunObject) -> tuple[ElasticPage, str]:
     Raises:
         ConfigError: the run's method has no material template, or the body moves as a whole or in hands.
     """
-    scene, model, data = scene_of(run, item), _model(run), item.data
+    scene, model, data = item.scene, _model(run), item.data
     _refuse(scene, item)
     states = [cast(Any, run.module.initial_states).state(item.first_sequence + i) for i in range(len(data.sequences))]
     projection = model.modal_projection(item.scene_id)

@@ -1,9 +1,9 @@
-"""Predictions of a trained run, and selection of its objects and sequences."""
+"""Objects of a trained run and predictions of their sequences."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 from torch import Tensor
@@ -14,7 +14,6 @@ from gausim.core.errors import DataError
 from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
 from gausim.evaluation.endurance import RandomPushes, endure
-from gausim.evaluation.stability import largest_eigenvalue
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.runs.checkpoint import read_checkpoint
@@ -24,13 +23,65 @@ from gausim.runs.directory import RunDirectory
 PUSHED_FRAMES = 240
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class RunObject:
-    """One object of a run."""
+    """One object of a run; called with a sequence, it predicts that with the trained model, and keeps the result."""
 
+    run: LoadedRun
     scene_id: int  # index of the object in the run
     data: ObjectData  # data of the object
     first_sequence: int  # index of its first sequence over all objects
+    least_frames: int = 0  # number of frames that are predicted at least, also if the recording is shorter
+    _known: dict[str, Trajectory] = field(default_factory=dict)
+
+    @property
+    def scene(self) -> GaussianScene:
+        """The rest scene that the run was trained on."""
+        return self.run.module.scenes[self.scene_id]
+
+    @property
+    def levels(self) -> dict[str, Any] | None:
+        """Units per level of the hierarchy, those predicted, N_F and N_K; None for a model without a hierarchy."""
+        model: Any = self.run.module.model
+        hierarchies = getattr(model, "hierarchies", None)
+        if hierarchies is None:
+            return None
+        hierarchy, predicted = hierarchies[self.scene_id], list(model.predicted_levels)
+        counts = [level.count for level in hierarchy.levels]
+        predictions = hierarchy.predictions(predicted)
+        return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
+
+    @property
+    def units(self) -> tuple[Tensor, ...]:
+        """The unit of every kernel at each level, the finest first; empty for a model without a hierarchy."""
+        units_of_kernels: Any = getattr(self.run.module.model, "units_of_kernels", lambda scene_id: ())
+        return tuple(units_of_kernels(self.scene_id))
+
+    @property
+    def footnotes(self) -> dict[str, Any]:
+        """Remarks on the method (see :attr:`GausSimModule.footnotes`)."""
+        return self.run.module.footnotes
+
+    def sequence(self, name: str) -> SequenceRecord:
+        """A sequence by its name.
+
+        Raises:
+            DataError: the object has no sequence of this name.
+        """
+        records = {record.name: record for record in self.data.sequences}
+        if name not in records:
+            raise DataError(f"{self.data.root}: has no sequence '{name}'; it has {list(records)}.")
+        return records[name]
+
+    def __call__(self, record: SequenceRecord, frames: int | None = None) -> Trajectory:
+        """The predicted first frames of a sequence, by default as many as recorded."""
+        count = frames or record.count
+        known = self._known.get(record.name)
+        if known is None or known.frames < count:
+            place = [own.name for own in self.data.sequences].index(record.name)
+            steps = max(record.count, self.least_frames, count) - 1
+            known = self._known[record.name] = self.run.module.predict(self.first_sequence + place, steps)
+        return known.part(slice(count))
 
 
 def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObject]:
@@ -41,7 +92,7 @@ def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObjec
     """
     found, first = [], 0
     for scene_id, data in enumerate(run.objects):
-        found.append(RunObject(scene_id, data, first))
+        found.append(RunObject(run, scene_id, data, first))
         first += len(data.sequences)
     have = [item.data.name for item in found]
     unknown = [name for name in names or () if name not in have]
@@ -50,21 +101,9 @@ def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObjec
     return [item for item in found if names is None or item.data.name in names]
 
 
-def sequence_of(item: RunObject, name: str) -> SequenceRecord:
-    """A sequence of an object by its name.
-
-    Raises:
-        DataError: the object has no sequence of this name.
-    """
-    records = {record.name: record for record in item.data.sequences}
-    if name not in records:
-        raise DataError(f"{item.data.root}: has no sequence '{name}'; it has {list(records)}.")
-    return records[name]
-
-
-def scene_of(run: LoadedRun, item: RunObject) -> GaussianScene:
-    """The rest scene that the run was trained on."""
-    return run.module.scenes[item.scene_id]
+def run_object(run: LoadedRun, name: str | None = None) -> RunObject:
+    """The run's object of this name, or its first one; errors are those of :func:`run_objects`."""
+    return run_objects(run, None if name is None else [name])[0]
 
 
 def state_of(run: LoadedRun) -> dict[str, Any]:
@@ -79,71 +118,15 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
     return {"finished": directory.is_finished, "epoch": known.get("epoch"), "updates": known.get("global_step")}
 
 
-class TrainedPrediction:
-    """Predicts sequences of one object with the trained model, and caches them.
-
-    Args:
-        run: the loaded run.
-        item: the object.
-        frames: least number of frames to predict, also if the recording is shorter.
-    """
-
-    def __init__(self, run: LoadedRun, item: RunObject, *, frames: int = 0) -> None:
-        self._run, self._item, self._frames = run, item, frames
-        self._ids = {record.name: item.first_sequence + i for i, record in enumerate(item.data.sequences)}
-        self._known: dict[str, Trajectory] = {}
-
-    @property
-    def levels(self) -> dict[str, Any] | None:
-        """Units per level of the hierarchy, those predicted, N_F and N_K; None for a model without a hierarchy."""
-        model: Any = self._run.module.model
-        hierarchies = getattr(model, "hierarchies", None)
-        if hierarchies is None:
-            return None
-        hierarchy, predicted = hierarchies[self._item.scene_id], list(model.predicted_levels)
-        counts = [level.count for level in hierarchy.levels]
-        predictions = hierarchy.predictions(predicted)
-        return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
-
-    @property
-    def units(self) -> tuple[Tensor, ...]:
-        """The unit of every kernel at each level, the finest first; empty for a model without a hierarchy."""
-        units_of_kernels = getattr(self._run.module.model, "units_of_kernels", lambda scene_id: ())
-        return tuple(units_of_kernels(self._item.scene_id))
-
-    @property
-    def footnotes(self) -> dict[str, Any] | None:
-        """Remarks on the method (see :attr:`GausSimModule.footnotes`), with the largest eigenvalue of the step."""
-        footnotes, model = self._run.module.footnotes, self._run.module.model
-        if not isinstance(model, GausSim):
-            return footnotes
-        largest = largest_eigenvalue(model, self._item.scene_id)
-        note = f"Largest eigenvalue of the step, linearised at rest: {largest:.4f}; small motions grow above 1."
-        return {**footnotes, "largest_eigenvalue": largest, "notes": [*footnotes["notes"], note]}
-
-    def __call__(self, record: SequenceRecord, frames: int | None = None) -> Trajectory:
-        """The predicted first frames of a sequence, by default as many as recorded."""
-        count = frames or record.count
-        known = self._known.get(record.name)
-        if known is None or known.frames < count:
-            steps = max(record.count, self._frames, count) - 1
-            known = self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
-        return known.part(slice(count))
-
-
-def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
+def endurance(item: RunObject, frames: int) -> dict[str, Any]:
     """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
-    if not isinstance(run.module.model, GausSim):
+    run, module = item.run, cast(Any, item.run.module)
+    if not isinstance(module.model, GausSim):
         raise ConfigError(
-            f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
+            f"--endurance: {module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
         )
-    scene, model, states = (
-        scene_of(run, item).to(run.device),
-        cast(Any, run.module.model),
-        cast(Any, run.module.initial_states),
-    )
-    dynamics = SceneDynamics(model, item.scene_id)
-    first, hands = states.state(item.first_sequence).detach(), cast(Any, run.module).method.hands(item.first_sequence)
+    scene, dynamics = item.scene.to(run.device), SceneDynamics(module.model, item.scene_id)
+    first, hands = module.initial_states.state(item.first_sequence).detach(), module.method.hands(item.first_sequence)
     free = scene.simulated & ~scene.pinned
     pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
     still = SimState(scene.means, scene.means)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,36 +29,13 @@ from gausim.training.transfer import load_shared
 UNTRAINED = "gausim"
 
 
-@dataclass(frozen=True)
-class EvenMaterial:
-    """The material of a body that was never filmed, the same everywhere.
-
-    Raises:
-        ConfigError: a number is not positive and finite.
-    """
-
-    # over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s]
-    stiffness: float = 1.0
-    damping: float = 0.5  # amplitudes fall as exp(-damping t / 2) [1 / s]
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"--{name} {value:g}: expected a number > 0.")
-
-    @property
-    def period(self) -> float:
-        """Period of the slowest swing [s]."""
-        return 1 / math.sqrt(self.stiffness)
-
-
 def open_scene(
     scene: GaussianScene,
     *,
     fps: float,
     base: Path | None = None,
-    material: EvenMaterial | None = None,
+    stiffness: float | None = None,
+    damping: float | None = None,
     seed: int = 0,
     sway: float = 0.0,
     gravity: float | None = None,
@@ -69,29 +45,29 @@ def open_scene(
 ) -> Interaction:
     """Opens a scene without videos, some of its kernels pinned, for interaction.
 
-    ``base`` is a trained run of the neural simulator whose network and decoders move it, with an even ``material``;
-    None: an untrained model of this ``seed``, of the reference material where no ``material`` is given. ``sway`` is the
-    initial displacement per frame of the kernel farthest from the pins [diagonals], ``gravity`` the unit of weight
-    [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the number of latest frames that
-    are kept (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
+    ``base`` is a trained run of the neural simulator whose network and decoders move it; None: an untrained model of
+    this ``seed``. The material is the same everywhere: ``stiffness`` is over that of the material whose slowest swing
+    takes one second (1), amplitudes fall as exp(-``damping`` t / 2) [1 / s] (0.5); without a base and both it is the
+    reference material. ``sway`` is the initial displacement per frame of the kernel farthest from the pins [diagonals],
+    ``gravity`` the unit of weight [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the
+    number of latest frames that are kept (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
 
     Raises:
         SceneError: no kernel is pinned.
-        ConfigError: there is no such device, the frame rate is not positive and finite, or ``base`` is a run of
-            another model.
+        ConfigError: there is no such device, a number is not positive and finite, or ``base`` is a run of another
+            model.
     """
-    if not (math.isfinite(fps) and fps > 0):
-        raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
+    for name, value in (("fps", fps), ("stiffness", stiffness), ("damping", damping)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ConfigError(f"--{name} {value:g}: expected a number > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
     if base is None:
         model = _built(compose([f"model={UNTRAINED}"]).model.simulator, scene, fps)
     else:
         model = _of_base(scene, fps, base)
-    if material is None and base is not None:
-        material = EvenMaterial()
-    if material is not None:
-        give_even_material(model, 0, period=material.period, damping=material.damping)
+    if base is not None or stiffness is not None or damping is not None:
+        give_even_material(model, 0, period=(stiffness or 1.0) ** -0.5, damping=damping or 0.5)
     place, swaying = find_device(device), initial_sway(scene, sway)
     initial = SimState(swaying.positions.to(place), swaying.previous.to(place))
     model = model.to(place)

@@ -8,7 +8,6 @@ from gausim.core.errors import (
     ConfigError,
     DataError,
     DivergenceError,
-    FetchError,
     GausSimError,
     RunError,
     SceneError,
@@ -17,7 +16,6 @@ from gausim.core.errors import (
 # Only the errors are imported eagerly, so that the command line can report errors without loading torch.
 if TYPE_CHECKING:
     from gausim.core.camera import Cameras
-    from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
     from gausim.core.protocols import (
         Adjustable,
         Dynamics,
@@ -37,13 +35,13 @@ if TYPE_CHECKING:
     from gausim.core.surroundings import Floor, HandPath, HandPose, Surroundings
 
 __all__ = [
-    "Adjustable", "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
-    "FittedDynamics", "FittedMethod", "FittedState", "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
+    "Adjustable", "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics",
+    "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
     "HandPose", "Handled", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions",
-    "Steppable", "Frame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
+    "Steppable", "Frame", "Stepper", "Surroundings", "Trajectory", "roll_out", "trajectory_of",
 ]  # fmt: skip
 
-_LATE = ("camera", "fitted", "protocols", "scene", "state", "surroundings")
+_LATE = ("camera", "protocols", "scene", "state", "surroundings")
 
 
 def __getattr__(name: str) -> Any:

@@ -43,10 +43,6 @@ class DivergenceError(GausSimError):
     """Training or simulation produced NaN or infinity; the message names the step and the term."""
 
 
-class FetchError(GausSimError):
-    """A published run or data set cannot be fetched: unknown, unreachable, damaged, unsafe, or the disk is full."""
-
-
 def sentence(error: Exception) -> str | None:
     """One line on an error that a user can act on; None for a defect of gausim.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,11 @@ from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, R
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
-from gausim.evaluation.markdown import markdown
-from gausim.evaluation.recorder import PictureRecorder
+from gausim.evaluation.film import Film
 from gausim.evaluation.references import Bounces, Reference
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
+from gausim.report.render import evaluation_page
 from gausim.results.curves import (
     CHAMFER,
     ERROR_3D,
@@ -40,20 +40,17 @@ from gausim.results.curves import (
     TRUTH,
     ImageMetricInfo,
     ObjectCurves,
-    ObjectFacts,
     save_curves,
 )
-from gausim.results.diagnosis import Diagnosis
-from gausim.results.pictures import save_pictures
-from gausim.results.summary import entries_of, info_of, metrics_of
-from gausim.results.table import SCHEMA, STATIC, Results, save_results
+from gausim.results.summary import entries_of, frame_splits, metrics_of
+from gausim.results.table import NO_FORESIGHT, SCHEMA, STATIC, ObjectInfo, Results, save_results
 from gausim.runs.cost import CostMeter
 from gausim.runs.provenance import code_provenance, data_provenance
 from gausim.training.supervision.points import attach_points
 
 # Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. Its optional attributes
 # ``levels`` (plain data: counts, predicted, predictions, kernels) and ``footnotes`` (extrapolates, notes) are stored in
-# the summary; with ``units`` (the unit of every kernel, level by level) its error is also computed by level.
+# the summary.
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
@@ -81,9 +78,9 @@ def absent_metrics(side: int) -> dict[str, str]:
     return {metrics.LPIPS.key: reason} if reason else {}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Task:
-    """What is measured of an object, and with what."""
+    """What is measured of an object, and with what; and quantities over all sequences."""
 
     data: ObjectData
     scene: GaussianScene
@@ -95,17 +92,12 @@ class _Task:
     look: SceneAppearance
     attached: Tensor | None  # the kernel of every true point
     linear: dict[str, LinearAR]
-
-
-class _Totals:
-    """Quantities over all sequences: colour of the foreground, largest l2, costs, oscillation and bounces."""
-
-    def __init__(self, task: _Task) -> None:
-        self.max_l2 = 0.0
-        self.color = torch.zeros(4, dtype=torch.float64)  # sum of the true foreground's colours, and its pixels
-        self.costs = {name: CostMeter() for name in task.methods}
-        self.diagnosis = Diagnosis(task.data.fps)
-        self.bounces = Bounces(task.data)
+    film: Film | None  # of the first sequence
+    costs: dict[str, CostMeter]
+    bounces: Bounces
+    # sum of the true foreground's colours, and its pixels
+    color: Tensor = field(default_factory=lambda: torch.zeros(4, dtype=torch.float64))
+    max_l2: float = 0.0
 
 
 def evaluate_object(
@@ -118,11 +110,13 @@ def evaluate_object(
     views: Sequence[str] | None = None,
     flip: bool = False,
     advance: Callable[[str], None] | None = None,
+    films: Path | None = None,
 ) -> ObjectCurves:
     """Per-frame figures of every method (a prediction by its row) and reference on every sequence of an object.
 
     The rest scene has all kernels of the trajectories. Sequences and views are all, unless named; ``flip`` measures
     FLIP, too, in as much time as everything else. ``advance`` is called with a sequence's name when it is done.
+    ``films`` is a folder for ``film_OBJECT.mp4`` of the first method on the first sequence.
 
     Raises:
         ConfigError: FLIP is wanted and not installed.
@@ -132,76 +126,69 @@ def evaluate_object(
     records = _chosen(data, sequences)  # before the task, which reads the true motion of all
     side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
     reference, points = Reference(data, scene), data.rest_points
+    chosen = data.views if views is None else views
+    train, heldout = ([v for v in chosen if (v in data.train_views) == is_train] for is_train in (True, False))
     task = _Task(
-        data, scene, methods, renderer, list(data.views if views is None else views), default_metrics(side, flip=flip),
-        reference, SceneAppearance.of(scene, scene.foreground),
-        None if points is None else attach_points(scene, points),
+        data, scene, methods, renderer, train + heldout, default_metrics(side, flip=flip), reference,
+        SceneAppearance.of(scene, scene.foreground), None if points is None else attach_points(scene, points),
         _linear_references(data) if reference.name == STATIC else {},
+        None if films is None else Film(data, records[0].name, train + heldout),
+        {name: CostMeter() for name in methods}, Bounces(data),
     )  # fmt: skip
-    totals, results, pictures = _Totals(task), list[Rows](), PictureRecorder(data, records[0].name, task.views)
+    results = list[Rows]()
     for record in records:
         # A separate record, so that its decoded frames are freed with it.
-        results.append(_sequence(task, totals, data.record(record.name), pictures if record is records[0] else None))
+        results.append(_sequence(task, data.record(record.name), is_first=record is records[0]))
         if advance is not None:
             advance(record.name)
-    r, g, b = (totals.color[:3] / totals.color[3].clamp_min(1)).tolist()
-    shown = [ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in task.metrics]
-    facts = ObjectFacts(
-        name=data.name,
+    r, g, b = (task.color[:3] / task.color[3].clamp_min(1)).tolist()
+    told = {name: getattr(predict, "footnotes", None) or {} for name, predict in methods.items()}
+    info = ObjectInfo(
+        splits=frame_splits(max(record.count for record in records), data.train_frames.stop),
+        reference=reference.name,
+        methods=list(methods),
+        sequences=[record.name for record in records],
+        frames=[record.count for record in records],
         fps=data.fps,
-        sequences=tuple(r.name for r in records),
-        frames=tuple(r.count for r in records),
-        views=tuple(task.views),
-        train_views=tuple(v for v in task.views if v in data.train_views),
-        first_unseen=data.train_frames.stop,
-        methods=tuple(methods),
-        metrics=(*shown, MASK_IOU),
+        train_views=train,
+        heldout_views=heldout,
         mean_color=(r, g, b),
-        max_l2=totals.max_l2,
-        reference=task.reference.name,
+        max_l2=task.max_l2,
+        sources=data_provenance(data),
+        absent=absent_metrics(side),
+        notes={
+            name: [NO_FORESIGHT] * (own.get("extrapolates") is False) + list(own.get("notes", []))
+            for name, own in told.items()
+        },
+        film="" if task.film is None or films is None else task.film.write(films / f"film_{data.name}.mp4"),
     )
-    return ObjectCurves(facts, _stack(results), _record(task, totals, absent_metrics(side)), pictures.finish())
+    shown = [ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in task.metrics]
+    costs = {
+        name: {**meter.summary(), "levels": getattr(methods[name], "levels", None), "fit": told[name].get("fit")}
+        for name, meter in task.costs.items()
+    }
+    return ObjectCurves(data.name, info, _stack(results), (*shown, MASK_IOU), costs, task.bounces.summary())
 
 
 def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> Results:
-    """Writes metrics.json, metrics.npz, pictures.npz and table.md to ``folder``; returns the content of metrics.json.
+    """Writes metrics.json, metrics.npz and table.md to ``folder``; returns the content of metrics.json.
 
     ``run`` is what was evaluated; its ``seed`` is that of the methods' entries.
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_curves(folder / "metrics.npz", objects)
-    save_pictures(folder / "pictures.npz", [c.pictures for c in objects if c.pictures is not None])
     results = results_of(objects, run)
     save_results(folder / "metrics.json", results)
-    (folder / "table.md").write_text(markdown(results))
+    (folder / "table.md").write_text(evaluation_page(results))
     return results
 
 
 def results_of(objects: Sequence[ObjectCurves], run: dict[str, Any]) -> Results:
     """The long table of evaluated objects."""
     table = [entry for curves in objects for entry in entries_of(curves, run.get("seed"))]
-    infos = {curves.facts.name: info_of(curves) for curves in objects}
+    infos = {curves.name: curves.info for curves in objects}
     known = code_provenance()
     return Results(SCHEMA, run=run, provenance=known, objects=infos, metrics=metrics_of(objects), table=table)
-
-
-def _record(task: _Task, totals: _Totals, absent: dict[str, str]) -> dict[str, Any]:
-    """Besides the figures: costs of every method, hashes of the data, absent metrics, oscillation, bounces."""
-    levels, footnotes = _told(task, "levels"), _told(task, "footnotes")
-    facts = {
-        "efficiency": {name: {**meter.summary(), "levels": levels[name]} for name, meter in totals.costs.items()},
-        "sources": data_provenance(task.data),
-        "absent": absent,
-        "footnotes": {name: found for name, found in footnotes.items() if found is not None},
-        "diagnosis": totals.diagnosis.summary(),
-        "bounce": totals.bounces.summary(),
-    }
-    return {key: found for key, found in facts.items() if found is not None}
-
-
-def _told(task: _Task, attribute: str) -> dict[str, Any]:
-    """An optional attribute of every method, None where it has none."""
-    return {name: getattr(predict, attribute, None) for name, predict in task.methods.items()}
 
 
 def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecord]:
@@ -226,19 +213,19 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR]:
 
 
 @torch.no_grad()
-def _sequence(task: _Task, totals: _Totals, record: SequenceRecord, pictures: PictureRecorder | None) -> Rows:
-    """Figures of one sequence, (F, V) and (F,) per row and metric; adds the frames to ``pictures``."""
+def _sequence(task: _Task, record: SequenceRecord, *, is_first: bool) -> Rows:
+    """Figures of one sequence, (F, V) and (F,) per row and metric; the frames of the first are filmed."""
     trajectories = {}
     for name, predict in task.methods.items():
-        made = totals.costs[name].predict(partial(predict, record), record.count - 1)
+        made = task.costs[name].predict(partial(predict, record), record.count - 1)
         trajectories[name] = _checked(task, name, record, made)
     truth = task.data.ground_truth(record)
     reference = task.reference.trajectory(record, truth)
     device = next((made.positions.device for made in trajectories.values()), reference.positions.device)
-    rows = _images(task, totals, record, trajectories, reference.to(device), pictures)
+    rows = _images(task, record, trajectories, reference.to(device), task.film if is_first else None)
     if truth is not None:
         moved = {name: trajectory.to("cpu") for name, trajectory in trajectories.items()}
-        _points(task, totals, rows, {**moved, task.reference.name: reference}, truth)
+        _points(task, rows, {**moved, task.reference.name: reference}, truth)
     return rows
 
 
@@ -257,11 +244,10 @@ def _checked(task: _Task, name: str, record: SequenceRecord, trajectory: Traject
 
 def _images(
     task: _Task,
-    totals: _Totals,
     record: SequenceRecord,
     trajectories: Mapping[str, Trajectory],
     reference: Trajectory,
-    pictures: PictureRecorder | None,
+    film: Film | None,
 ) -> Rows:
     """Image figures of every frame and view, and the image energy of the truth."""
     cameras = record.cameras_of(task.views)
@@ -269,23 +255,22 @@ def _images(
     parts: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
     before: dict[str, Tensor] = {}
     for frames in _chunks(record, len(task.views)):
-        recorded = record.frames(frames, task.views)
-        target, alpha = composite(recorded)
+        target, alpha = composite(record.frames(frames, task.views))
         target, alpha = target.to(first.rgb), alpha.to(first.alpha)
         mask = alpha > 0
-        totals.color += torch.cat((target[mask].sum(0, dtype=torch.float64), mask.sum()[None].double())).cpu()
+        task.color += torch.cat((target[mask].sum(0, dtype=torch.float64), mask.sum()[None].double())).cpu()
         images = {
-            name: totals.costs[name].draw(partial(_draw, task, t, frames, cameras), mask.shape[:2].numel())
+            name: task.costs[name].draw(partial(_draw, task, t, frames, cameras), mask.shape[:2].numel())
             for name, t in trajectories.items()
         }
-        if pictures is not None:
-            pictures.add(recorded, images)
+        if film is not None:
+            film.add(target, next(iter(images.values())).rgb)
         if task.reference.name == STATIC:  # one frame, drawn once
             images[STATIC] = Rendered(first.rgb.expand_as(target), first.alpha.expand_as(alpha))
         else:
             images[task.reference.name] = _draw(task, reference, frames, cameras)
         largest = (next(iter(images.values())).rgb - target).norm(dim=-1).max()
-        totals.max_l2 = max(totals.max_l2, float(largest))
+        task.max_l2 = max(task.max_l2, float(largest))
         for name, shown in images.items():
             parts[name][IOU].append(metrics.mask_iou(shown.alpha, alpha))
             for metric in task.metrics:
@@ -305,9 +290,7 @@ def _draw(task: _Task, trajectory: Trajectory, frames: range, cameras: Cameras) 
     return Rendered(images.rgb.clamp(0, 1), images.alpha)
 
 
-def _points(
-    task: _Task, totals: _Totals, rows: Rows, trajectories: Mapping[str, Trajectory], truth: GroundTruth
-) -> None:
+def _points(task: _Task, rows: Rows, trajectories: Mapping[str, Trajectory], truth: GroundTruth) -> None:
     """Adds 3D errors and energies to the rows."""
     attached = task.attached
     assert attached is not None
@@ -318,12 +301,9 @@ def _points(
     displacement = truth.positions - truth.rest
     for name, linear in task.linear.items():
         predicted[name] = truth.rest + linear.rollout(displacement[: linear.order], len(truth.positions) - 1)
-    moving = {name: points for name, points in predicted.items() if name != task.reference.name}
-    units = {name: [unit.cpu()[attached] for unit in found] for name, found in _told(task, "units").items() if found}
-    totals.diagnosis.add(truth.positions, truth.rest, moving, units)
     diagonal = task.data.diagonal or float((truth.rest.amax(0) - truth.rest.amin(0)).norm())
     every = {**predicted, TRUTH: truth.positions}
-    totals.bounces.add(every, diagonal)
+    task.bounces.add(every, diagonal)
     for name, points in every.items():
         row = rows.setdefault(name, {})
         if name != TRUTH:

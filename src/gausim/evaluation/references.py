@@ -10,20 +10,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.baselines.references import BallisticDynamics, FollowHandsDynamics, StaticDynamics, rigid_fit
+from gausim.baselines.references import ballistic_motion, hands_motion, rigid_fit, static_motion
 from gausim.core import GaussianScene, SimState, Trajectory
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.metrics import Bounce, bounce
-from gausim.results.curves import BALLISTIC, FOLLOW_HANDS, STATIC, TRUTH
+from gausim.results.curves import BALLISTIC, FOLLOW_HANDS, TRUTH
+from gausim.results.table import STATIC
 
 
 class Reference:
     """The reference prediction of an object.
 
-    * ``follow hands``, of a body in hands: :class:`gausim.baselines.references.FollowHandsDynamics`.
+    * ``follow hands``, of a body in hands: :func:`gausim.baselines.references.hands_motion`.
     * ``ballistic``, of a free body whose motion is known: seen frames are the rigid flight from the true frames 0 and 1
-      on, unseen ones that from the last two seen frames on (:class:`gausim.baselines.references.BallisticDynamics`).
+      on, unseen ones that from the last two seen frames on (:func:`gausim.baselines.references.ballistic_motion`).
     * ``static``, of all others: the rest state.
 
     Attributes:
@@ -42,21 +43,19 @@ class Reference:
 
     def trajectory(self, record: SequenceRecord, truth: GroundTruth | None) -> Trajectory:
         """Its prediction of a sequence."""
-        rest, steps = self._scene.means, record.count - 1
-        still = SimState(rest, rest)
         if self.name == FOLLOW_HANDS and record.hands is not None:
-            return FollowHandsDynamics(self._scene, record.hands, fps=self._fps).rollout(still, steps)
+            return hands_motion(self._scene, record.hands, fps=self._fps, steps=record.count - 1)
         if self.name == BALLISTIC and truth is not None:
             return self._flight(truth, record.count)
-        return StaticDynamics(self._scene, fps=self._fps).rollout(still, steps)
+        return static_motion(self._scene, fps=self._fps, steps=record.count - 1)
 
     def _flight(self, truth: GroundTruth, count: int) -> Trajectory:
-        flight, seen = BallisticDynamics(self._scene, fps=self._fps), min(self._seen, count)
+        seen = min(self._seen, count)
 
         def states(first: int, now: int, stop: int) -> Trajectory:
             """Flight from frames ``first`` and ``now`` on, beginning with frame ``now``."""
-            before, state = self._placed(truth, first), self._placed(truth, now)
-            return flight.rollout(SimState(state, before), stop - 1 - now)
+            state = SimState(self._placed(truth, now), self._placed(truth, first))
+            return ballistic_motion(self._scene, state, fps=self._fps, steps=stop - 1 - now)
 
         parts = (states(0, 0, 1), states(0, 1, seen), states(seen - 2, seen - 1, count))
 
@@ -94,10 +93,10 @@ class Bounces:
             heights = floor.height(positions.double()).cpu().numpy()
             self._found.setdefault(name, []).append(bounce(heights, diagonal))
 
-    def summary(self) -> dict[str, dict[str, float | None]] | None:
-        """The entry ``bounce`` of ``metrics.json`` (see :mod:`gausim.results.summary`), or None without a floor."""
+    def summary(self) -> dict[str, dict[str, float | None]]:
+        """The figures of every row and of the truth; empty without a floor."""
         if not self._found:
-            return None
+            return {}
         true = self._found[TRUTH]
         return {
             name: {

@@ -44,7 +44,7 @@ def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) 
 
 
 def write_durably(
-    path: Path, data: bytes, *, check: Callable[[Path], None] | None = None, previous: Path | None = None
+    path: Path, data: bytes, *, check: Callable[[Path], object] | None = None, previous: Path | None = None
 ) -> None:
     """Writes a file atomically, see :func:`replacing`.
 

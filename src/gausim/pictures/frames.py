@@ -1,28 +1,20 @@
-"""Comparison of images of truth and prediction: side-by-side frames, error colours, space-time slices."""
+"""Comparison of films of truth and prediction: videos side by side, sheets of single frames, error colours."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
 
 # Colour distance at the bright end of the error colours; the largest possible one is sqrt(3).
 ERROR_RANGE = 0.5
-PANEL_HEIGHT = 320
+PANEL_HEIGHT, SHEET_HEIGHT = 320, 160  # least height of the images in videos and sheets
 _BAR, _LINE = 24, 8
 SEEN, UNSEEN = (120, 160, 200), (240, 150, 40)
+# Films: (F, H, W, 3) uint8, or a list of frames.
+Frames = Sequence[np.ndarray] | np.ndarray
 _INK, _PAPER = (235, 235, 235), (24, 24, 24)
-# Brightness to which the brightest percentile of the true foreground is raised, and the largest gain.
-_LIGHT, _MOST_GAIN = 230.0, 2.5
-
-
-@dataclass(frozen=True)
-class Timeline:
-    """Number of a video's frames, and the first unseen one."""
-
-    frames: int
-    first_unseen: int
 
 
 def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
@@ -32,30 +24,63 @@ def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
 
 
-def video_frame(
-    truth: np.ndarray | None,
-    prediction: np.ndarray,
-    frame: int,
-    timeline: Timeline,
+def comparison(
+    truth: Frames,
+    prediction: Frames,
     title: str,
+    first_unseen: int,
     *,
     height: int = PANEL_HEIGHT,
-) -> np.ndarray:
-    """One frame of a comparison: ground truth | prediction | error, labels above, the time line below.
+) -> Iterator[np.ndarray]:
+    """Frames of a video: ground truth | prediction | error, labels above, the time line below.
 
-    Images are (H, W, 3) uint8, enlarged to ``height`` rows if smaller; ``truth`` is None beyond the recorded
-    frames.
+    Images are (H, W, 3) uint8, enlarged to ``height`` rows if smaller; the truth may have fewer than the prediction.
     """
+    for frame, image in enumerate(prediction):
+        known = frame < len(truth)
+        labels = ["ground truth" if known else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
+        panels = _panels(truth[frame] if known else None, image, height)
+        labelled = [np.concatenate((label_bar(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
+        picture = np.concatenate(labelled, axis=1)
+        yield np.concatenate((picture, _timeline(frame, len(prediction), first_unseen, title, picture.shape[1])))
+
+
+def contact_sheet(truth: Frames, prediction: Frames, first_unseen: int, *, height: int = SHEET_HEIGHT) -> np.ndarray:
+    """One picture of about eight frames: truth, prediction and error below each other, unseen ones marked orange.
+
+    They are the first, the last seen, the first unseen, the last, and evenly spaced ones between; images are those of
+    :func:`comparison`.
+    """
+    last = len(prediction) - 1
+    edges = {0, min(first_unseen - 1, last), min(first_unseen, last), last}
+    even = np.linspace(0, last, 8).round().astype(int).tolist()
+    columns = []
+    for frame in sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2}):
+        panels = _panels(truth[frame] if frame < len(truth) else None, prediction[frame], height)
+        bar = label_bar(str(frame), panels[0].shape[1])
+        if frame >= first_unseen:
+            bar[-4:] = UNSEEN
+        columns.append(np.concatenate((bar, *panels)))
+    return np.concatenate(columns, axis=1)
+
+
+def shrunk(frames: np.ndarray, rows: int) -> np.ndarray:
+    """(F, H, W, 3) frames, shrunk to ``rows`` rows if they have more."""
+    if frames.shape[1] <= rows:
+        return frames
+    size = max(1, round(frames.shape[2] * rows / frames.shape[1])), rows
+    return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+
+
+def _panels(truth: np.ndarray | None, prediction: np.ndarray, height: int) -> list[np.ndarray]:
+    """Truth, prediction and error of one frame, enlarged to ``height`` rows if smaller."""
     missing = np.full_like(prediction, _PAPER[0])
     error = missing if truth is None else error_colors(truth, prediction)
     panels = [missing if truth is None else truth, prediction, error]
-    zoom = max(1.0, height / prediction.shape[0])
-    if zoom > 1:
-        panels = [cv2.resize(p, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) for p in panels]
-    labels = ["ground truth" if truth is not None else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
-    labelled = [np.concatenate((label_bar(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
-    picture = np.concatenate(labelled, axis=1)
-    return np.concatenate((picture, timeline_bar(frame, timeline, title, picture.shape[1])))
+    zoom = height / prediction.shape[0]
+    if zoom <= 1:
+        return panels
+    return [cv2.resize(p, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) for p in panels]
 
 
 def label_bar(text: str, width: int) -> np.ndarray:
@@ -64,42 +89,19 @@ def label_bar(text: str, width: int) -> np.ndarray:
     return cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.48, _INK, 1, cv2.LINE_AA)
 
 
-def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
+def _timeline(frame: int, frames: int, first_unseen: int, title: str, width: int) -> np.ndarray:
     """Title, number of the frame and time line, which is orange from the first unseen frame on."""
-    unseen = frame >= timeline.first_unseen
+    unseen = frame >= first_unseen
     state = "UNSEEN" if unseen else "seen in training"
-    bar = label_bar(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
-    if unseen:
-        bar[:, -_BAR:] = UNSEEN
-    return np.concatenate((bar, time_line(frame, timeline, width)))
-
-
-def time_line(frame: int, timeline: Timeline, width: int) -> np.ndarray:
-    """The time line up to a frame, with a mark at the first unseen frame."""
+    bar = label_bar(f"{title}   frame {frame}/{frames - 1}   {state}", width)
     line = np.full((_LINE, width, 3), _PAPER, np.uint8)
-    begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
+    begin, now = (round(width * f / frames) for f in (first_unseen, frame + 1))
     line[:, : min(begin, now)] = SEEN
     line[:, begin:now] = UNSEEN
     line[:, min(begin, width - 1) :][:, :2] = _INK
-    return line
-
-
-def moving_line(frames: np.ndarray) -> tuple[str, int]:
-    """The image line with the most motion per pixel in (F, H, W, 3) frames: ("column" | "row", index)."""
-    moved = np.zeros(frames.shape[1:3])
-    for before, after in zip(frames[:-1], frames[1:], strict=True):
-        moved += np.square(after.astype(np.float32) - before.astype(np.float32)).sum(-1)
-    columns, rows = moved.mean(0), moved.mean(1)
-    if columns.max() >= rows.max():
-        return "column", int(columns.argmax())
-    return "row", int(rows.argmax())
-
-
-def space_time_slice(frames: np.ndarray, line: tuple[str, int]) -> np.ndarray:
-    """One image line of all (F, H, W, 3) frames side by side: (pixels of the line, F, 3), time to the right."""
-    kind, index = line
-    picked = frames[:, :, index] if kind == "column" else frames[:, index]
-    return picked.swapaxes(0, 1)
+    if unseen:
+        bar[:, -_BAR:] = UNSEEN
+    return np.concatenate((bar, line))
 
 
 def brighten(frames: np.ndarray, gain: float) -> np.ndarray:
@@ -108,10 +110,3 @@ def brighten(frames: np.ndarray, gain: float) -> np.ndarray:
         return frames
     table = np.clip(np.arange(256) * gain + 0.5, 0, 255).astype(np.uint8)
     return table[frames]
-
-
-def light_gain(truth: np.ndarray) -> float:
-    """Gain for display of the foreground of (..., 4) uint8 frames, RGB premultiplied with alpha."""
-    opaque = truth[truth[..., 3] > 128][:, :3]
-    bright = float(np.percentile(opaque.max(-1), 95)) if len(opaque) else _LIGHT
-    return round(min(_MOST_GAIN, max(1.0, _LIGHT / max(bright, 1.0))), 2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -11,14 +10,14 @@ from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report import paper
 from gausim.report.study import EFFECT, EFFECT_SIGMA, Study, families, method_notes
 from gausim.results.curves import CHAMFER, ERROR_3D, IOU, TRACK_ERROR
-from gausim.results.pivot import Column, Grid, Line, Pivot
+from gausim.results.pivot import Column, Grid, Pivot
 from gausim.results.summary import AHEAD, MOTION_ENERGY, RATIO
 from gausim.results.table import NO_FORESIGHT, SPLIT_TITLES, VIEW_TITLES, Cell
 
 # Sections of tables, in the order of a page.
 COMPARISON, ABLATIONS, MOTION = "Comparison", "Ablations", "3D error and motion"
-TRAINING_VIEWS, NEW_VIEWS, CONTRAST = "Images in the training views", "Images in new views", "Colour contrast"
-SECTIONS = (COMPARISON, ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, CONTRAST)
+TRAINING_VIEWS, NEW_VIEWS = "Images in the training views", "Images in new views"
+SECTIONS = (COMPARISON, ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS)
 SPREAD = "± deviation over seeds; in brackets, deviation over sequences (root mean square over seeds)."
 ERROR_RATIO = ERROR_3D + RATIO
 # The paper's splits; `unseen_all` exists for recordings beyond frame 49.
@@ -43,9 +42,6 @@ _ABLATED = (
     (ERROR_RATIO, "points", "seen"), (ERROR_RATIO, "points", "unseen"), (MOTION_ENERGY, "points", "unseen"),
 )  # fmt: skip
 _BOUNCE = ("height", "height_error", "rise", "rise_error", "depth")
-_OSCILLATION = (
-    "velocity_cosine", "frequency_error", "damping_ratio", "phase_seen", "phase_unseen", "coarse_error", "fine_error",
-)  # fmt: skip
 _ENERGY_CAPTION = (
     "Predicted over true motion energy, all sequences together: 1 is right, 0 stands still. A prediction that "
     "dissipates gets deceptively low errors on late frames; this table tells."
@@ -55,17 +51,11 @@ _COSTS_CAPTION = (
     "CUDA. Per frame: without drawing, the first sequence warms up. Memory of a prediction: on a GPU the most that "
     "CUDA had allocated, on a CPU what it adds to the process. Compare costs of one machine only."
 )
-_OSCILLATION_CAPTION = (
-    "In the principal motions of the true points, weighted by their fraction of the squared displacement. Frequency "
-    "and damping: of the oscillation z(t+1) = a z(t) + b z(t-1) that fits all frames best. Phase: root mean square "
-    "over motions of the analytic signals' difference; unrelated motions have 104 degrees. Parts: units of the "
-    "coarsest and the finest level, their centres' error over that of rest, in all frames."
-)
 _BOUNCE_CAPTION = "Centre of the true points after the first contact with the floor, means over sequences."
 
 
 def layout(pivot: Pivot, name: str, kind: str, *, rows: Sequence[str] | None = None, **texts: str) -> Grid | None:
-    """A table of one object: comparison, ahead, bounce, motion, ablations, or all metrics of ``SPLIT VIEWS``.
+    """A table of one object: comparison, ahead, bounce, ablations, or all metrics of ``SPLIT VIEWS``.
 
     Empty ``kind``: everything known of the object, for tables made by hand. None without figures.
     """
@@ -80,8 +70,6 @@ def layout(pivot: Pivot, name: str, kind: str, *, rows: Sequence[str] | None = N
         columns = [pivot.column((name, f"+{n}", "points", ERROR_3D), f"+{n}") for n in AHEAD]
     elif kind == "bounce":
         columns = places([(metric, "points") for metric in _BOUNCE], "bounce")
-    elif kind == "motion":
-        columns = places([(metric, "points") for metric in _OSCILLATION], "motion")
     elif kind == "ablations":
         columns = [
             pivot.column((name, split, views, metric), more=f", {'new view, ' * (views == 'heldout')}{split}")
@@ -149,7 +137,7 @@ def declared_trials(pivot: Pivot) -> dict[str, int]:
 
 def grids(study: Study) -> list[Grid]:
     """All tables of a report, by sections."""
-    made = [summary(study.pivot), *_objects(study), *(_metric(study, *key) for key in _METRICS), _contrast(study)]
+    made = [summary(study.pivot), *_objects(study), *(_metric(study, *key) for key in _METRICS)]
     known = [grid for grid in made if grid is not None]
     if study.test:
         known = [replace(grid, caption=f"{grid.caption} {study.test}") for grid in known]
@@ -157,7 +145,7 @@ def grids(study: Study) -> list[Grid]:
 
 
 def _objects(study: Study) -> Iterator[Grid | None]:
-    """The tables of each object: comparison with costs, ablations of every model, errors ahead, bounce, oscillation."""
+    """The tables of each object: comparison with costs, ablations of every model, errors ahead, bounce."""
     for name, info in study.results.objects.items():
         last = "unseen" if "unseen" in info.splits else "seen"
         start, stop = info.splits[last]
@@ -176,7 +164,6 @@ def _objects(study: Study) -> Iterator[Grid | None]:
         for kind, title, caption in (
             ("ahead", ahead, "± deviation over seeds."),
             ("bounce", "bounce", _BOUNCE_CAPTION),
-            ("motion", "oscillation", _OSCILLATION_CAPTION),
         ):
             yield layout(study.pivot, name, kind, title=f"{name}, {title}", caption=caption, section=MOTION)
 
@@ -209,25 +196,3 @@ def _metric(study: Study, metric: str, views: str) -> Grid | None:
 def split_title(span: tuple[int, int], split: str) -> str:
     """Title of a split as in the paper: Seen, or Unseen with the number of frames."""
     return "Seen" if split == "seen" else f"Unseen {span[1] - span[0]}"
-
-
-def _contrast(study: Study) -> Grid | None:
-    """The paper's table of colour contrast, on which absolute errors of objects depend."""
-    heads = ("mean foreground colour", "its norm", "largest l2 of a pixel")
-    lines = []
-    for name, info in study.results.objects.items():
-        if info.mean_color is not None:
-            lines.append(_contrast_line(name, "method", info.mean_color, info.max_l2))
-        if theirs := paper.CONTRAST.get(paper.paper_object(name) or ""):
-            lines.append(_contrast_line(f"{name} (paper)", "paper", theirs[0], theirs[2]))
-    caption = (
-        "Against the black background. Bright objects get larger absolute errors from the same displacement: compare "
-        "errors between objects with this in mind. The largest l2 is that of the first run in this report."
-    )
-    columns = tuple(Column(("", "", "", head), head) for head in heads)
-    return Grid(columns, tuple(lines), "object", CONTRAST, caption, CONTRAST) if lines else None
-
-
-def _contrast_line(label: str, kind: str, color: Sequence[float], max_l2: float) -> Line:
-    shown = f"({', '.join(f'{c:.2f}' for c in color)})"
-    return Line(label, kind, (Cell(shown), Cell(math.hypot(*color)), Cell(max_l2)), (False,) * 3)

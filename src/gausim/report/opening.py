@@ -1,32 +1,19 @@
-"""First screens of a report: per run a video, two sentences, and one table."""
+"""First screens of a report: per run a film and a sentence."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 
-from gausim.core import RunError
-from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.layouts import ERROR_RATIO
-from gausim.report.media import Film, make_film
+from gausim.report.media import film_uri
 from gausim.report.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
 from gausim.report.study import Group, Study
-from gausim.report.verdict import NAMES, Outcome, outcome, sentences
-from gausim.results.pivot import Column, Grid, Pivot, joined
-from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import STATIC, ObjectInfo
+from gausim.report.verdict import merit, sentence
+from gausim.results.pivot import Pivot
 
-# Largest number of first screens, because videos make up most of a page's size.
+# Largest number of first screens, because films make up most of a page's size.
 MOST_OPENINGS = 6
-# Largest number of rows of its table; the last is the reference.
-MOST_ROWS = 6
-# Columns: metric, views, end of the heading.
-_COLUMNS = (
-    ("psnr", "train", ""), ("psnr", "heldout", ", new views"), ("ssim", "train", ""), ("lpips", "train", ""),
-    (ERROR_RATIO, "points", ""), (MOTION_ENERGY, "points", ""),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +23,10 @@ class Opening:
     label: str  # its label in the list of first screens
     name: str  # of the object
     title: str  # heading: the object and the row
-    row: str  # label of its row
-    seed: str  # its seed, empty if there is one only
-    run: RunRecord  # of the video
-    sentences: tuple[str, str]  # over all seeds of the row
-    grid: Grid | None
-    film: Film | None
-    problem: str  # reason for a missing video, and the remedy
-    unfinished: bool  # whether the figures are of an unfinished training
+    run: RunRecord  # of the film
+    sentence: str  # over all seeds of the row
+    film: str  # data URI of the MP4; empty without one
+    caption: str  # of the film, or why there is none
 
 
 def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening], int]:
@@ -61,15 +44,26 @@ def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
     """The evaluated runs of an object, sorted by error, with the best seed of every row first."""
     found = []
     for group in study.groups:
-        seeds = [(_merit(run, name, group.method, info), run) for run, info in group.entries(name)]
-        for place, (merit, run) in enumerate(sorted(seeds, key=lambda seed: seed[0])):
-            found.append(((place, merit), (name, group, run)))
+        entries = [(run, info) for run, info in group.entries(name) if run.results is not None]
+        seeds = [(merit(Pivot(run.results), name, group.method, info), run) for run, info in entries if run.results]
+        for place, (error, run) in enumerate(sorted(seeds, key=lambda seed: seed[0])):
+            found.append(((place, error), (name, group, run)))
     return [shown for _, shown in sorted(found, key=lambda item: item[0])]
 
 
-def _merit(run: RunRecord, name: str, method: str, info: ObjectInfo) -> float:
-    assert run.results is not None
-    return outcome(Pivot(run.results), name, method, info).merit
+def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
+    entries = group.entries(name)
+    seed = f"seed {run.seed}" if len(entries) > 1 else ""
+    parts = (name if len(study.objects) > 1 else "", group.label if len(study.groups) > 1 else "", seed)
+    film, caption = "", "Films were left out (--no-pictures)."
+    if pictures:
+        film, caption = film_uri(run, name), f"{seed}: {run.objects[name].film}" if seed else run.objects[name].film
+        remedy = f"The evaluation has no film. Make it with `gausim evaluate {shlex.quote(str(run.path))}`."
+        caption = caption if film else remedy
+    return Opening(
+        label=" · ".join(filter(None, parts)) or name, name=name, title=f"{name}, predicted by {group.label}", run=run,
+        sentence=sentence(study.pivot, name, group.label, entries[0][1], group.method), film=film, caption=caption,
+    )  # fmt: skip
 
 
 def unanswered(study: Study) -> list[str]:
@@ -86,96 +80,3 @@ def unanswered(study: Study) -> list[str]:
         for run in study.runs
         if run.results is None
     ]
-
-
-def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
-    entries = group.entries(name)
-    seed = f"seed {run.seed}" if len(entries) > 1 else ""
-    parts = (name if len(study.objects) > 1 else "", group.label if len(study.groups) > 1 else "", seed)
-    film, problem = None, "Videos were left out (--no-pictures)."
-    if pictures:
-        try:
-            film = make_film(run, name, group.method)
-        except RunError as error:
-            problem = f"There is no video: {error}"
-    return Opening(
-        label=" · ".join(filter(None, parts)) or name,
-        name=name,
-        title=f"{name}, predicted by {group.label}",
-        row=group.label,
-        seed=seed,
-        run=run,
-        sentences=sentences(_outcome(study, group, name)),
-        grid=first_grid(study, group, name),
-        film=film,
-        problem=problem,
-        unfinished=any(r.is_from_unfinished for r, _ in entries),
-    )
-
-
-def _outcome(study: Study, group: Group, name: str) -> Outcome:
-    return outcome(study.pivot, name, group.label, group.entries(name)[0][1], group.method)
-
-
-def first_grid(study: Study, group: Group, name: str) -> Grid | None:
-    """The table of a first screen: ranges of frames of a single row, else the best rows on unseen frames."""
-    info = study.results.objects[name]
-    rivals = [g for g in study.groups if g.entries(name)]
-    splits = [split for split in ("seen", "unseen") if split in info.splits]
-    reference = info.reference if info.reference in NAMES else STATIC
-    if len(rivals) == 1:
-        grids = [_part(study, name, split, {group.label: f"{split} {_span(info.splits[split])}"}) for split in splits]
-        grids.append(_part(study, name, splits[-1], {reference: NAMES[reference]}))
-        stub = "frames"
-        caption = f"{NAMES[reference].capitalize()}: the {reference} prediction of the {splits[-1]} frames."
-    else:
-        ordered = sorted(rivals, key=lambda rival: _outcome(study, rival, name).merit)
-        labels = {rival.label: rival.label for rival in ordered[: MOST_ROWS - 1]}
-        grids, stub = [_part(study, name, splits[-1], labels | {reference: NAMES[reference]})], "method"
-        left = f" The best {len(labels)} of {len(ordered)} rows; all are below." if len(ordered) > len(labels) else ""
-        caption = f"Frames {_span(info.splits[splits[-1]])} ({splits[-1]}).{left}"
-    found = joined(grids)
-    return None if found is None else _tidy(replace(found, stub=stub), f"{caption} {_legend(info, reference)}", study)
-
-
-def _part(study: Study, name: str, split: str, labels: dict[str, str]) -> Grid | None:
-    """The rows of one range of frames, with other labels."""
-    columns = []
-    for metric, views, more in _COLUMNS:
-        known = study.results.metrics.get(metric)
-        if known is not None:
-            found = study.pivot.column((name, split, views, metric), more=more)
-            columns.append(found or Column((name, split, views, metric), "", known.digits, known.better))
-    grid = study.pivot.grid(columns, rows=list(labels))
-    if grid is None:
-        return None
-    return replace(grid, lines=tuple(replace(line, label=labels[line.label]) for line in grid.lines))
-
-
-def _tidy(grid: Grid, caption: str, study: Study) -> Grid:
-    """The grid without empty columns and deviations over sequences."""
-    kept = [i for i in range(len(grid.columns)) if any(line.cells[i] is not None for line in grid.lines)]
-    lines = [
-        replace(
-            line,
-            cells=tuple(cell and cell._replace(std=None) for cell in (line.cells[i] for i in kept)),
-            best=tuple(line.best[i] for i in kept),
-        )
-        for line in grid.lines
-    ]
-    columns = tuple(grid.columns[i] for i in kept)
-    return replace(grid, columns=columns, lines=tuple(lines), caption=f"{caption} {study.test}".strip())
-
-
-def _span(split: Sequence[int]) -> str:
-    return f"{split[0]}–{split[1] - 1}"
-
-
-def _legend(info: ObjectInfo, reference: str) -> str:
-    text = (
-        f"3D: error over that of {NAMES[reference]}, below 1 is better. Motion energy: predicted over true, 1 is right."
-        " ± is the deviation over seeds."
-    )
-    if info.absent.get("lpips") == NO_WEIGHTS:
-        text += f" LPIPS: its weights were not there; `{HOW_TO_GET_WEIGHTS}` gets them, then evaluate again."
-    return text

@@ -47,15 +47,6 @@ ABLATION: dict[str, tuple[Pair, Pair]] = {
 }
 ABLATION_OBJECT = "mothorchids"
 
-# Object -> (mean foreground colour, its norm, largest l2 of a pixel), as printed.
-CONTRAST: dict[str, tuple[tuple[float, float, float], float, float]] = {
-    "mothorchids": ((0.22, 0.14, 0.14), 0.30, 0.67),
-    "carnation": ((0.21, 0.23, 0.18), 0.37, 0.91),
-    "pudding": ((0.24, 0.15, 0.06), 0.29, 0.87),
-    "duck": ((0.35, 0.31, 0.17), 0.50, 0.95),
-    "bunny": ((0.78, 0.73, 0.67), 1.26, 1.63),
-}
-
 # Method -> (seconds per frame, gigabytes), 23422 kernels on one A100, drawing included as the paper measures it.
 EFFICIENCY: dict[str, tuple[float, float]] = {
     "DreamGaussian4D (paper)": (0.14, 7.6),
@@ -63,7 +54,6 @@ EFFICIENCY: dict[str, tuple[float, float]] = {
     "GausSim w/o hierarchy (paper)": (0.36, 3.5),
     "GausSim (paper)": (0.13, 2.1),
 }
-LEVELS = (23422, 1203, 11)
 
 
 def paper_object(name: str) -> str | None:

@@ -1,19 +1,23 @@
-"""Tables as Markdown and LaTeX, and pages from templates that name tables of records."""
+"""Tables as Markdown and LaTeX."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from dataclasses import replace
 
-from jinja2 import Environment, StrictUndefined, TemplateError
-
-from gausim.core import RunError
-from gausim.report.layouts import compact, layout, summary
+from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
+from gausim.report.layouts import layout
 from gausim.results.pivot import Grid, Pivot, markdown_table, texts
-from gausim.results.table import Made, Results, load_results
+from gausim.results.table import SPLIT_TITLES, VIEW_TITLES, Made, Results
 
-TEMPLATE = "page.md"
+LEGEND = (
+    "Mean, in brackets standard deviation over sequences; `÷ static` is the ratio to the static prediction (below 1 is "
+    "better), `÷ ballistic` and `÷ follow hands` to rigid flight and to following the hands at once, of bodies that "
+    "move so; motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still); "
+    "the floor is the reconstruction itself against frame 0. Images are foreground on black."
+)
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
@@ -52,9 +56,8 @@ def grouped(grid: Grid) -> list[tuple[str, int]]:
 
 def _flat(grid: Grid) -> Grid:
     """The grid with the common headings in those of the columns, for formats without them."""
-    heads = [f"{c.group}: {c.label}" if c.group else c.label for c in grid.columns]
-    columns = tuple(c.__class__(c.place, head, c.digits, c.better) for c, head in zip(grid.columns, heads, strict=True))
-    return Grid(columns, grid.lines, grid.stub, grid.title, grid.caption, grid.section)
+    columns = [replace(c, label=f"{c.group}: {c.label}" if c.group else c.label) for c in grid.columns]
+    return replace(grid, columns=tuple(columns))
 
 
 def origin(made: Made) -> list[str]:
@@ -98,73 +101,24 @@ def markdown_escape(text: str) -> str:
     return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
 
 
-def page(folder: Path) -> str:
-    """The page of ``folder/page.md``, a template that names tables and facts of the records ``folder/*.json``.
-
-    In the template ``table("RECORD", "OBJECT", "KIND")`` is a table of an object (see
-    :func:`gausim.report.layouts.layout`; ``stub`` is the heading of its labels), ``summary("RECORD", ROWS)`` that of
-    all objects, ``compact("RECORD", OBJECTS, PLACES, ROWS)`` means of several objects, ``number("RECORD", ROW, OBJECT,
-    METRIC, VIEWS, SPLIT)`` one mean, ``made("RECORD")`` commits and commands of the record, ``RECORD.NAME`` a fact.
-
-    Raises:
-        RunError: the template or a record is missing or malformed, or names something that is not there.
-    """
-    advice = "Record it again with `gausim report DIR --record FILE.json`."
-    pivots = {path.stem: Pivot(load_results(path, advice)) for path in sorted(folder.glob("*.json"))}
-
-    def known(name: str) -> Pivot:
-        if name not in pivots:
-            raise RunError(f"{folder / TEMPLATE}: names the record '{name}', expected one of {list(pivots)}.")
-        return pivots[name]
-
-    def table(record: str, name: str, kind: str = "", stub: str = "method") -> str:
-        pivot = known(record)
-        if name not in pivot.results.objects:
-            told = list(pivot.results.objects)
-            raise RunError(f"{folder / TEMPLATE}: record '{record}' has no object '{name}', expected one of {told}.")
-        return _shown(layout(pivot, name, kind, stub=stub), f"'{kind}' of {name} in the record '{record}'")
-
-    def number(record: str, row: str, name: str, metric: str, views: str = "", split: str = "", digits: int = 2) -> str:
-        value = known(record).number(row, (name, split, views, metric))
-        if value is None:
-            raise RunError(f"{folder / TEMPLATE}: record '{record}' has no {metric} {views} {split} of {row}, {name}.")
-        return f"{value:,.{digits}f}"
-
-    def _shown(grid: Grid | None, what: str) -> str:
-        if grid is None:
-            raise RunError(f"{folder / TEMPLATE}: there are no figures for {what}.")
-        return markdown_table(grid)
-
-    environment = Environment(
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-        comment_start_string="<#",  # anchors such as {#step} are no comments
-        comment_end_string="#>",
-    )
-    environment.globals = {
-        "table": table,
-        "number": number,
-        "summary": lambda name, rows=None: _shown(summary(known(name), rows), f"a summary of the record '{name}'"),
-        "compact": lambda name, *arguments, **options: _shown(
-            compact(known(name), *arguments, **options), f"a compact table of the record '{name}'"
-        ),
-        "made": lambda name: _block(known(name).results),
-        **{name: {key: _fact(fact) for key, fact in p.results.facts.items()} for name, p in pivots.items()},
-    }
-    try:
-        text = environment.from_string((folder / TEMPLATE).read_text()).render()
-    except (OSError, TemplateError) as error:
-        raise RunError(f"{folder / TEMPLATE}: cannot be made into a page ({error}).") from error
-    return f"<!-- Made by `make results` from docs/results/: change the template or the records there. -->\n{text}"
-
-
-def _fact(fact: float | str) -> str:
-    return fact if isinstance(fact, str) else f"{fact:,.10g}"
-
-
-def _block(results: Results) -> str:
-    """Commits, commands, and looks at the test part for a page."""
-    made = results.made or Made("unknown")
-    told = [made.test, ""] if made.test else []
-    told += [f"Made by ({', '.join(made.commits)}; recorded {made.recorded})", ""]
-    return "\n".join([*told, *(f"    {line}" for command in made.commands for line in command.splitlines())])
+def evaluation_page(results: Results) -> str:
+    """``table.md`` of an evaluation: every figure of each object, and notes on its methods."""
+    pivot, run = Pivot(results), ", ".join(f"{key} {value}" for key, value in results.run.items())
+    absent = [NO_LPIPS] if any(info.absent.get("lpips") == NO_WEIGHTS for info in results.objects.values()) else []
+    parts = ["# Evaluation", run, " ".join([LEGEND, *absent])]
+    for name, info in results.objects.items():
+        parts.append(f"## {name}\n\n{len(info.sequences)} sequences of {max(info.frames)} frames at {info.fps:g} fps.")
+        places = [(split, views) for views in VIEW_TITLES for split in info.splits]
+        kinds = {f"{split} {views}": f"{SPLIT_TITLES[split]} {info.splits[split][0]}..{info.splits[split][1] - 1}, "
+                 f"{VIEW_TITLES[views]}" for split, views in places}  # fmt: skip
+        kinds |= {"ahead": "3D error by frames after the last seen one", "bounce": "bounce", "": "cost"}
+        for kind, title in kinds.items():
+            grid = layout(pivot, name, kind, stub="row")
+            parts += [] if grid is None else [f"### {title}\n\n{markdown_table(grid, markdown_escape)}"]
+        color = info.mean_color or (0.0, 0.0, 0.0)
+        parts.append(
+            f"Contrast: mean foreground colour ({', '.join(f'{c:.2f}' for c in color)}), its norm "
+            f"{math.hypot(*color):.2f}; largest l2 of a pixel {info.max_l2:.2f}."
+        )
+        parts += [f"* {row}: {note}" for row in info.methods for note in info.notes.get(row, [])]
+    return "\n\n".join(parts) + "\n"

@@ -12,15 +12,12 @@ from typing import Any
 import msgspec
 
 from gausim.report import paper
-from gausim.report.commands import joined
-from gausim.report.rows import FULL, About, besides_object, differing, first_few, make_rows
+from gausim.report.rows import ABLATIONS, FULL, About, besides_object, differing, first_few, make_rows
 from gausim.report.runs import BROKEN, FAILURE, NOT_EVALUATED, NOT_RECORDED, UNFINISHED, RunRecord
 from gausim.results.pivot import Pivot
 from gausim.results.table import METHOD, PAPER, SCHEMA, Cell, Entry, Made, Metric, ObjectInfo, Results
 
-NOT_MEASURED = "not measured"
-# The paper's order of rows and columns; others follow.
-_ORDER = ("jointly", "w/o network", "w/o mass", "w/o momentum", "w/o hierarchy")
+_ORDER = list(ABLATIONS.values())
 # States of runs without a number, in the order of precedence.
 _WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
 # Change of l2 in unseen frames against the full model, and the same in standard errors over seeds.
@@ -54,16 +51,16 @@ class Group:
     @property
     def runs(self) -> tuple[RunRecord, ...]:
         """All of its runs."""
-        return tuple(run for same in self.about.values() for run in same)
+        return tuple(dict.fromkeys(run for same in self.about.values() for run in same))
 
     @property
     def objects(self) -> tuple[str, ...]:
         """All of its objects."""
-        return tuple(name for names in self.about for name in names)
+        return tuple(self.about)
 
-    def of(self, name: str) -> tuple[RunRecord, ...]:
+    def of(self, name: str) -> list[RunRecord]:
         """The runs of an object, which differ by their seeds."""
-        return next((same for names, same in self.about.items() if name in names), ())
+        return self.about.get(name, [])
 
     @property
     def evaluated(self) -> list[RunRecord]:
@@ -74,12 +71,10 @@ class Group:
         """Evaluated runs and their facts of an object."""
         return [(r, r.objects[name]) for r in self.of(name) if name in r.objects]
 
-    def state(self, name: str, metric: str) -> str:
-        """Why a figure is missing; empty if the group has nothing to do with the object."""
-        entries, states = self.entries(name), {r.status for r in self.of(name)}
-        if entries:
-            return next((why for _, info in entries if (why := info.absent.get(metric))), NOT_MEASURED)
-        return next((s for s in _WORST if s in states), NOT_MEASURED) if name in self.objects else ""
+    def state(self, name: str) -> str:
+        """Why an object has no figures: the worst state of its runs; empty where there are some."""
+        states = {r.status for r in self.of(name)}
+        return "" if self.entries(name) else next((s for s in _WORST if s in states), "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,15 +96,6 @@ class Study:
         """What every table says where figures are of the test part."""
         return self.results.made.test if self.results.made else ""
 
-    def sources(self, row: str, name: str) -> tuple[RunRecord, ...]:
-        """The runs that a figure of a row comes from: of a method all seeds, of a reference the first run."""
-        group = next((group for group in self.groups if group.label == row), None)
-        if group is not None:
-            return tuple(run for run, _ in group.entries(name)) or group.of(name)
-        if row in paper.METHODS or row in paper.EFFICIENCY:
-            return ()
-        return tuple(run for group in self.groups for run, _ in group.entries(name))[:1]
-
 
 def make_study(runs: Sequence[RunRecord], title: str = "Report") -> Study:
     """Groups runs by the rows of the tables."""
@@ -124,7 +110,7 @@ def make_study(runs: Sequence[RunRecord], title: str = "Report") -> Study:
     groups.sort(key=lambda g: (models.index(g.family), _place(g.variation)))
     objects = [o for g in groups for run in g.evaluated for o in run.objects] + [o for g in groups for o in g.objects]
     return Study(tuple(runs), tuple(groups), tuple(dict.fromkeys(objects)), _results(runs, groups, title),
-                 tuple(_notes(groups)))  # fmt: skip
+                 tuple(dict.fromkeys(_notes(groups))))  # fmt: skip
 
 
 def _place(variation: str) -> list[int]:
@@ -154,14 +140,14 @@ def _results(runs: Sequence[RunRecord], groups: Sequence[Group], title: str) -> 
             own = [e for e in run.results.table if e.row == group.method]
             table += [msgspec.structs.replace(e, row=group.label, seed=run.seed) for e in own]
             for name, info in run.objects.items():
-                objects.setdefault(name, msgspec.structs.replace(info, sources={}, diagnosis=None))
+                objects.setdefault(name, msgspec.structs.replace(info, sources={}))
                 found = (e for e in run.results.table if e.object == name and e.row not in methods)
                 others.setdefault(name, list(found))
     table += [entry for found in others.values() for entry in found]
     made = Made(
         recorded=datetime.now(UTC).date().isoformat(),
         commits=list(dict.fromkeys(run.commit for run in evaluated)),
-        commands=joined(run.command for run in evaluated),
+        commands=list(dict.fromkeys(run.command for run in evaluated)),
         hardware=list(dict.fromkeys(_machine(run) for run in evaluated)),
         test=_test_part(groups),
         missing=[f"{run.name} ({run.status})" for run in runs if run.results is None],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from gausim.results.table import INFORMED, PAPER, Cell, Entry, Metric, Results, pooled
@@ -107,12 +107,6 @@ class Pivot:
         return Grid(kept, lines, **texts) if lines else None
 
 
-def joined(grids: Iterable[Grid | None]) -> Grid | None:
-    """The rows of grids with the same columns below each other; None without any."""
-    known = [grid for grid in grids if grid is not None]
-    return replace(known[0], lines=tuple(line for grid in known for line in grid.lines)) if known else None
-
-
 def _best(cells: Sequence[Cell | None], column: Column) -> float | None:
     """Merit of the best of at least two figures."""
     merits = [merit for cell in cells if cell is not None and (merit := _merit(cell, column)) is not None]
@@ -157,9 +151,5 @@ def texts(grid: Grid, escape: Callable[[str], str] = str, bold: str = "**{}**") 
 def markdown_table(grid: Grid, escape: Callable[[str], str] = str) -> str:
     """The grid as GitHub Markdown, the best figures bold; ``escape`` is applied to every text."""
     head, *rows = texts(grid, escape)
-    return markdown_rows([head, ["---"] * len(head), *rows])
-
-
-def markdown_rows(rows: Sequence[Sequence[str]]) -> str:
-    """The rows of a table as GitHub Markdown, the rule below the first among them."""
-    return "\n".join("|" + "|".join(f" {text} " if text else " " for text in row) + "|" for row in rows)
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("|" + "|".join(f" {text} " if text else " " for text in line) + "|" for line in lines)

@@ -19,10 +19,8 @@ from gausim.results.curves import (
     TRACK_ERROR,
     TRUTH,
     ObjectCurves,
-    finite,
 )
-from gausim.results.diagnosis import read_diagnosis
-from gausim.results.table import INFORMED, METHOD, NO_FORESIGHT, REFERENCE, Entry, Kind, Metric, ObjectInfo
+from gausim.results.table import INFORMED, METHOD, REFERENCE, Entry, Kind, Metric
 
 # Frames after the last seen one of which errors are kept.
 AHEAD = (1, 2, 5, 10, 20, 30, 50, 100)
@@ -53,19 +51,11 @@ METRICS = {
     "per_image": Metric("per image", "ms"),
     "memory": Metric("prediction, memory", "MB", digits=1),
     "hardware": Metric("on"),
-    "eigenvalue": Metric("largest eigenvalue", digits=4),
     "height": Metric("highest point after the impact", "scene units", digits=3),
     "height_error": Metric("its error", "%", "low", 1),
     "rise": Metric("rise", "scene units", digits=3),
     "rise_error": Metric("its error", "%", "low", 1),
     "depth": Metric("deepest below the floor", "% of the diagonal"),
-    "velocity_cosine": Metric("first velocity, cosine", "", "high"),
-    "frequency_error": Metric("frequency error", "%", "low", 1),
-    "damping_ratio": Metric("damping / true", "", "one"),
-    "phase_seen": Metric("phase error, seen", "°", "low", 0),
-    "phase_unseen": Metric("phase error, unseen", "°", "low", 0),
-    "coarse_error": Metric("error, large parts", "", "low"),
-    "fine_error": Metric("error, small parts", "", "low"),
 }
 _BOUNCE = {"height": 1.0, "height_error": 100.0, "rise": 1.0, "rise_error": 100.0, "depth": 1.0}
 
@@ -86,44 +76,19 @@ def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
 def metrics_of(objects: Sequence[ObjectCurves]) -> dict[str, Metric]:
     """Display of all metrics of evaluated objects."""
     found: dict[str, Metric] = {}
-    for info in (info for curves in objects for info in curves.facts.metrics):
+    for info in (info for curves in objects for info in curves.metrics):
         found[info.key] = Metric(info.label, info.unit, "high" if info.higher_is_better else "low")
         if not info.higher_is_better:
             found[info.key + RATIO] = Metric(f"{info.label} ÷ {{reference}}", "", "low", 3)
     return found | {CHAMFER + RATIO: Metric("Chamfer ÷ {reference}", "", "low", 3)} | METRICS
 
 
-def info_of(curves: ObjectCurves) -> ObjectInfo:
-    """Facts of an evaluated object."""
-    facts, record = curves.facts, curves.record
-    notes = record.get("footnotes", {})
-    return ObjectInfo(
-        splits=frame_splits(max(facts.frames), facts.first_unseen),
-        reference=facts.reference,
-        methods=list(facts.methods),
-        sequences=list(facts.sequences),
-        frames=list(facts.frames),
-        fps=facts.fps,
-        train_views=[facts.views[i] for i in curves.view_indices("train")],
-        heldout_views=[facts.views[i] for i in curves.view_indices("heldout")],
-        mean_color=facts.mean_color,
-        max_l2=facts.max_l2,
-        sources=record.get("sources", {}),
-        absent=record.get("absent", {}),
-        notes={
-            name: [NO_FORESIGHT] * (told.get("extrapolates") is False) + list(told.get("notes", []))
-            for name, told in notes.items()
-        },
-        diagnosis=record.get("diagnosis"),
-    )
-
-
 def entries_of(curves: ObjectCurves, seed: Any = None) -> list[Entry]:
     """All figures of an evaluated object, of methods first."""
-    facts, methods = curves.facts, curves.facts.methods
+    methods, reference = curves.info.methods, curves.info.reference
     rows = [*methods, *(row for row in curves.rows if row not in methods)]
     # The linear references are fitted to the true motion, and rigid flight begins again from its last seen frames.
-    kinds: dict[str, Kind] = {facts.reference: INFORMED if facts.reference == BALLISTIC else REFERENCE}
+    kinds: dict[str, Kind] = {reference: INFORMED if reference == BALLISTIC else REFERENCE}
     kinds |= {method: METHOD for method in methods}
     found: list[Entry] = []
 
@@ -132,12 +97,12 @@ def entries_of(curves: ObjectCurves, seed: Any = None) -> list[Entry]:
         for metric, (value, deviation) in figures.items():
             if isinstance(value, str) or (value is not None and math.isfinite(value)):
                 kept = None if deviation is None or not math.isfinite(deviation) else deviation
-                found.append(Entry(row, kind, facts.name, split, views, metric, own, value, kept))
+                found.append(Entry(row, kind, curves.name, split, views, metric, own, value, kept))
 
     for row in rows:
         for split, views, figures in _figures(curves, row):
             add(row, split, views, figures)
-    for row, split, views, figures in [*_floor(curves), *_motion(curves), *_bounces(curves), *_costs(curves)]:
+    for row, split, views, figures in [*_floor(curves), *_bounces(curves), *_costs(curves)]:
         add(row, split, views, figures)
     return found
 
@@ -147,15 +112,14 @@ Figures = dict[str, tuple[Any, float | None]]
 
 def _figures(curves: ObjectCurves, row: str) -> Iterator[tuple[str, str, Figures]]:
     """Figures of a row: split, views, and value and deviation over sequences by metric."""
-    facts = curves.facts
-    scales = {m.key: m.scale for m in facts.metrics} | _SCALES
-    higher = {m.key for m in facts.metrics if m.higher_is_better}
-    reference = curves.values.get(facts.reference, {})
+    scales = {m.key: m.scale for m in curves.metrics} | _SCALES
+    higher = {m.key for m in curves.metrics if m.higher_is_better}
+    reference = curves.values.get(curves.info.reference, {})
     groups = {g: found for g in ("train", "heldout") if (found := curves.view_indices(g))}
     own = curves.values[row]
-    last = facts.first_unseen - 1
-    ahead = {f"+{n}": (last + n, last + n + 1) for n in AHEAD if last + n < max(facts.frames)}
-    for split, span in (frame_splits(max(facts.frames), facts.first_unseen) | ahead).items():
+    last, frames = curves.first_unseen - 1, max(curves.info.frames)
+    ahead = {f"+{n}": (last + n, last + n + 1) for n in AHEAD if last + n < frames}
+    for split, span in (curves.info.splits | ahead).items():
         for views, columns in {"points": None, **groups}.items():
             figures: Figures = {}
             for metric, values in own.items():
@@ -207,9 +171,9 @@ Rows = Iterator[tuple[str, str, str, Figures]]
 
 def _floor(curves: ObjectCurves) -> Rows:
     """The reconstruction against frame 0 of every training view."""
-    reference, views = curves.values.get(curves.facts.reference), curves.view_indices("train")
+    reference, views = curves.values.get(curves.info.reference), curves.view_indices("train")
     if reference is not None and views:
-        metrics = [m for m in curves.facts.metrics if m.key in reference]
+        metrics = [m for m in curves.metrics if m.key in reference]
         moments = {m.key: (m.scale, *_moments(reference[m.key][:, 0][:, views].mean(1))) for m in metrics}
         yield (
             FLOOR,
@@ -219,31 +183,16 @@ def _floor(curves: ObjectCurves) -> Rows:
         )
 
 
-def _motion(curves: ObjectCurves) -> Rows:
-    """Oscillation of every row beside the truth, where that is known."""
-    found = read_diagnosis(curves.record.get("diagnosis"), curves.facts.first_unseen)
-    for row, motion in found.rows.items() if found is not None else ():
-        if row != TRUTH and found is not None:
-            levels = [math.nan if level is None else level for level in motion.level_errors or [None]]
-            values = {
-                "velocity_cosine": motion.velocity_cosine, "frequency_error": 100 * found.frequency_error(row),
-                "damping_ratio": found.damping_ratio(row), "phase_seen": found.phase(row, seen=True),
-                "phase_unseen": found.phase(row, seen=False), "coarse_error": levels[-1], "fine_error": levels[0],
-            }  # fmt: skip
-            yield row, "motion", "points", {metric: (value, None) for metric, value in values.items()}
-
-
 def _bounces(curves: ObjectCurves) -> Rows:
-    for row, found in curves.record.get("bounce", {}).items():
-        scaled = {key: None if found[key] is None else scale * found[key] for key, scale in _BOUNCE.items()}
+    for row, found in curves.bounces.items():
+        scaled = {key: _times(scale, found[key]) for key, scale in _BOUNCE.items()}
         yield row, "bounce", "points", {key: (value, None) for key, value in scaled.items()}
 
 
 def _costs(curves: ObjectCurves) -> Rows:
     """Units, time and memory of every method's predictions and training."""
-    for row in curves.facts.methods:
-        cost, told = (curves.record.get(key, {}).get(row) or {} for key in ("efficiency", "footnotes"))
-        fit, memory, frame = told.get("fit") or {}, cost.get("memory") or {}, cost.get("seconds_per_frame") or {}
+    for row, cost in curves.costs.items():
+        fit, memory = cost.get("fit") or {}, cost.get("memory") or {}
         on_gpu = str(memory.get("kind")).startswith("CUDA")
         counts = (cost.get("levels") or {}).get("counts")
         values = {
@@ -251,14 +200,13 @@ def _costs(curves: ObjectCurves) -> Rows:
             "fit": _times(1 / 60, fit.get("cpu_seconds")),
             "fit_wall": _times(1 / 60, fit.get("seconds")),
             "fit_memory": _times(1e-9, fit.get("peak_bytes")),
-            "per_frame": frame.get("mean"),
+            "per_frame": cost.get("seconds_per_frame"),
             "per_image": _times(1e3, cost.get("seconds_per_image")),
             "memory": _times(1e-6, memory.get("peak_bytes" if on_gpu else "added_bytes")),
             "hardware": f"{cost['device']}, {cost['threads']} threads" if "device" in cost else None,
-            "eigenvalue": told.get("largest_eigenvalue"),
         }
         yield row, "", "", {metric: (value, None) for metric, value in values.items()}
 
 
 def _times(scale: float, value: float | None) -> float | None:
-    return None if value is None else finite(scale * value)
+    return None if value is None or not math.isfinite(value) else float(scale * value)

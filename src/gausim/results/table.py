@@ -83,7 +83,7 @@ class ObjectInfo(msgspec.Struct, omit_defaults=True, forbid_unknown_fields=True)
     sources: dict[str, Any] = {}  # files of the data and their hashes
     absent: dict[str, str] = {}  # metrics that could not be computed, and why
     notes: dict[str, list[str]] = {}  # notes on each method, in sentences
-    diagnosis: dict[str, Any] | None = None  # spectra and phases where the true motion is known
+    film: str = ""  # caption of film_OBJECT.mp4; empty without a film
 
     def repeats(self, method: str) -> bool:
         """Whether a method repeats its fitted motion instead of extrapolating."""

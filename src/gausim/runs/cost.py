@@ -31,7 +31,6 @@ class CostMeter:
 
     def __init__(self) -> None:
         self._seconds: list[float] = []
-        self._frames = 0
         self._peak, self._added = 0, list[int]()
         self._drawing, self._images = 0.0, 0
 
@@ -41,7 +40,6 @@ class CostMeter:
         before = _begin(cuda)
         result, seconds = _timed(make)
         self._seconds.append(seconds / max(1, frames))
-        self._frames += frames
         peak = peak_bytes()
         if before is not None and peak is not None:
             self._peak = max(self._peak, peak)
@@ -59,8 +57,7 @@ class CostMeter:
         """Plain data for ``metrics.json``; the first sequence is a warm-up, included only if it is the only one."""
         timed = self._seconds[1:] or self._seconds
         return {
-            "seconds_per_frame": {"mean": statistics.fmean(timed), "std": statistics.pstdev(timed)},
-            "frames": self._frames,
+            "seconds_per_frame": statistics.fmean(timed),
             "seconds_per_image": self._drawing / self._images if self._images else None,
             "memory": self._memory(),
             "device": torch.cuda.get_device_name() if torch.cuda.is_initialized() else "cpu",
@@ -70,10 +67,8 @@ class CostMeter:
     def _memory(self) -> dict[str, Any] | None:
         if not self._added:
             return None
-        first, *others = self._added
-        added = {"added_bytes": max(others or [first]), "first_added_bytes": first}
         kind = "CUDA allocated" if torch.cuda.is_initialized() else "process, resident"
-        return {"kind": kind, "peak_bytes": self._peak, **added}
+        return {"kind": kind, "peak_bytes": self._peak, "added_bytes": max(self._added[1:] or self._added)}
 
 
 class TrainingCost:

@@ -50,11 +50,6 @@ class RunDirectory:
         return self.path / LAST_CHECKPOINT
 
     @property
-    def has_checkpoint(self) -> bool:
-        """Whether there is a checkpoint."""
-        return any((self.path / name).is_file() for name in (LAST_CHECKPOINT, PREVIOUS_CHECKPOINT))
-
-    @property
     def is_finished(self) -> bool:
         """Whether the run is complete."""
         return (self.path / FINISHED).is_file()
@@ -63,22 +58,6 @@ class RunDirectory:
     def has_failed(self) -> bool:
         """Whether an error ended the run, and it was not resumed since."""
         return (self.path / FAILED).is_file()
-
-    def facts(self) -> dict[str, Any]:
-        """Facts recorded by a finished run.
-
-        Raises:
-            RunError: the run is not finished, or its marker file is unreadable.
-        """
-        path = self.path / FINISHED
-        try:
-            loaded = dict(json.loads(path.read_text()))
-            loaded["last_epoch"] = dict(loaded["last_epoch"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunError(
-                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with overwrite=true."
-            ) from error
-        return loaded
 
     def failure(self) -> str:
         """The error that ended a failed run, in one line."""
@@ -130,7 +109,7 @@ class RunDirectory:
                 f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
                 "old one with overwrite=true."
             )
-        if self.has_checkpoint:
+        if self.checkpoint_to_resume is not None:
             self.check_unchanged(config)
         resume = self._whole_checkpoint()
         write_durably(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False).encode())
@@ -141,7 +120,7 @@ class RunDirectory:
 
     @property
     def checkpoint_to_resume(self) -> Path | None:
-        """The checkpoint that a prepared run continues from, for ranks that follow the first one."""
+        """The checkpoint that a prepared run continues from, if any."""
         return next(filter(Path.is_file, (self.checkpoint, self.path / PREVIOUS_CHECKPOINT)), None)
 
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
@@ -163,41 +142,33 @@ class RunDirectory:
             file.write(json.dumps({"time": _now(), "event": event, **_who()}) + "\n")
 
     @contextmanager
-    def recording_failure(self) -> Iterator[None]:
-        """Context of training: an error that ends it is written to ``FAILED``.
+    def recording_failure(self, root: Path) -> Iterator[None]:
+        """Context of training: an error that ends it after :meth:`prepare` is written to ``FAILED``.
 
-        Errors before :meth:`prepare` succeeded, e.g. that the run is finished, are not written.
-        """
-        try:
-            yield
-        except Exception as error:
-            if self._prepared and not getattr(rank_zero_only, "rank", 0):
-                with suppress(OSError):  # the disk may have failed; raise the original error
-                    self._note(error)
-            raise
-
-    @contextmanager
-    def leaving_no_trace(self, root: Path) -> Iterator[None]:
-        """Context of training: a new run that fails before its first step (``has_stepped``) is removed.
-
-        Its directory goes, and so do those above it, below ``root``, that are then empty.
+        A new run that fails before its first step (``has_stepped``) is removed: its directory, and those above it,
+        below ``root``, that are then empty.
         """
         is_new = not (self.path / EVENTS).is_file()
         try:
             yield
-        except Exception:
-            if is_new and not self.has_stepped and not getattr(rank_zero_only, "rank", 0):
-                self._clear()
-                for name in (LOCK, *HYDRA_FILES):
-                    (self.path / name).unlink(missing_ok=True)
-                with suppress(OSError):  # of files that are not ours
-                    (self.path / HYDRA_FILES[0]).parent.rmdir()
-                    self.path.rmdir()
-                    for folder in self.path.resolve().parents:
-                        if not folder.is_relative_to(root.resolve()):
-                            break
-                        folder.rmdir()
+        except Exception as error:
+            with suppress(OSError):  # the disk may have failed, or holds files that are not ours
+                if getattr(rank_zero_only, "rank", 0):
+                    pass
+                elif is_new and not self.has_stepped:
+                    self._remove(root)
+                elif self._prepared:
+                    self._note(error)
             raise
+
+    def _remove(self, root: Path) -> None:
+        self._clear()
+        for name in (LOCK, *HYDRA_FILES):
+            (self.path / name).unlink(missing_ok=True)
+        hydras = (self.path / HYDRA_FILES[0]).parent
+        above = [folder for folder in self.path.resolve().parents if folder.is_relative_to(root.resolve())]
+        for folder in (*[hydras] * hydras.is_dir(), self.path, *above):
+            folder.rmdir()
 
     def _note(self, error: Exception) -> None:
         # Errors of gausim are self-explanatory; others get a traceback. The last line is the error itself.

@@ -10,27 +10,23 @@ from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, W
 from PIL import Image
 
 from gausim.io.video import read_video, video_rate, write_gif
-from gausim.training.media import Media
 
 
-def log_media(logger: Logger, media: Media) -> None:
-    """Shows the media of one optimiser step, if the logger shows media."""
+def log_media(logger: Logger, folder: Path, step: int) -> None:
+    """Shows the videos and pictures in a folder, if the logger shows media."""
     if isinstance(logger, TensorBoardLogger):
-        _to_tensorboard(logger, media)
+        for path in sorted(folder.iterdir()):
+            encoded = _gif(path) if path.suffix == ".mp4" else path.read_bytes()
+            _image(logger, f"{path.stem}/{'video' if path.suffix == '.mp4' else 'frames'}", encoded, step)
     elif isinstance(logger, WandbLogger):
-        _to_wandb(logger, media)
+        import wandb
+
+        shown: dict[str, object] = {"trainer/global_step": step}  # the x axis of Lightning's metrics
+        shown |= {f"media/{path.stem}/video": wandb.Video(str(path), format="mp4") for path in folder.glob("*.mp4")}
+        shown |= {f"media/{path.stem}/frames": wandb.Image(str(path)) for path in folder.glob("*.png")}
+        logger.experiment.log(shown)
     elif isinstance(logger, MLFlowLogger):
-        logger.experiment.log_artifacts(logger.run_id, str(media.folder), f"media/{media.folder.name}")
-
-
-def _to_tensorboard(logger: TensorBoardLogger, media: Media) -> None:
-    for name in media.names:
-        _image(logger, f"{name}/video", _gif(media.video(name)), media.step)
-        for kind, path in media.pictures(name).items():
-            _image(logger, f"{name}/{kind}", path.read_bytes(), media.step)
-    columns, rows = media.objects()
-    lines = ["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)]
-    logger.experiment.add_text("objects", "\n".join(lines), media.step)
+        logger.experiment.log_artifacts(logger.run_id, str(folder), f"media/{folder.name}")
 
 
 def _image(logger: TensorBoardLogger, tag: str, encoded: bytes, step: int) -> None:
@@ -49,15 +45,3 @@ def _gif(video: Path) -> bytes:
         path = Path(folder) / "video.gif"
         write_gif(path, read_video(video), video_rate(video))
         return path.read_bytes()
-
-
-def _to_wandb(logger: WandbLogger, media: Media) -> None:
-    import wandb
-
-    shown: dict[str, object] = {"trainer/global_step": media.step}  # the x axis of Lightning's metrics
-    for name in media.names:
-        shown[f"media/{name}/video"] = wandb.Video(str(media.video(name)), format="mp4")
-        shown |= {f"media/{name}/{kind}": wandb.Image(str(path)) for kind, path in media.pictures(name).items()}
-    columns, rows = media.objects()
-    shown["media/objects"] = wandb.Table(columns=list[str | int](columns), data=rows)
-    logger.experiment.log(shown)

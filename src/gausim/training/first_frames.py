@@ -11,13 +11,13 @@ from torch import Tensor
 from gausim.core import Cameras
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey
-from gausim.training.module import GausSimModule
+from gausim.training.learner import Learner
 
 # Frames before which a body is taken to fall freely.
 FREE_FALL = 4
 
 
-def begin_free_bodies(module: GausSimModule, datamodule: ReadyDataModule) -> None:
+def begin_free_bodies(module: Learner, datamodule: ReadyDataModule) -> None:
     """Sets the initial states of all sequences of free bodies from the silhouettes of frames 0 to 4.
 
     A run that is resumed does so too, before its states are restored: its baseline metrics are of these beginnings.

@@ -24,8 +24,8 @@ class States(NamedTuple):
     rotations: Float[Tensor, "T N 3 3"]
 
     @staticmethod
-    def of(steps: Sequence[Frame]) -> States:
-        """Stacks the steps of a stretch."""
+    def of(steps: Sequence[Any]) -> States:
+        """Stacks the steps of a stretch, which have its fields."""
         return States(*(torch.stack([getattr(step, name) for step in steps]) for name in States._fields))
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted, Recorded, moved
+from gausim.baselines.fitted import Fitted, FittedState, Recorded, moved
 from gausim.baselines.material_point.driven import Driven
 from gausim.baselines.mpm import (
     Filling,
@@ -32,7 +32,7 @@ from gausim.baselines.mpm import (
     fill_interior,
 )
 from gausim.baselines.mpm.substeps import warp
-from gausim.core import ConfigError, FittedState, GaussianScene
+from gausim.core import ConfigError, GaussianScene
 from gausim.nn.mlp import mlp, zero_output
 from gausim.nn.planes import SUM, Planes
 from gausim.ops.covariance import covariance_from_scales
@@ -215,10 +215,6 @@ class MaterialPoints(Fitted):
         """Young's modulus of the particles [simulation units]."""
         raise NotImplementedError
 
-    def kept(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """Fraction of the velocity that fitted damping leaves in a frame; None without it."""
-        return None
-
     def _body(self, scene_id: int, driven: Driven) -> Body:
         scene, domain = self.scenes[scene_id], self.domain
         settings, grid = domain.settings, domain.grid_of(scene)
@@ -264,14 +260,11 @@ class MaterialPoints(Fitted):
         """One frame of substeps; differentiable.
 
         Raises:
-            ConfigError: the configured number of substeps violates the bound of the time step.
             DivergenceError: a particle left the domain or is not finite.
         """
         scene_id = self.scene_of_sequence[state.sequence_id]
-        body, particles, kept = self.body(scene_id), ParticleState(*state.inner), self.kept(scene_id)
-        if kept is not None:
-            particles = replace(particles, velocities=kept * particles.velocities, affine=kept * particles.affine)
-        particles = body.solver.advance(particles, state.frame, young_modulus=self.modulus(scene_id))
+        body, young = self.body(scene_id), self.modulus(scene_id)
+        particles = body.solver.advance(ParticleState(*state.inner), state.frame, young_modulus=young)
         x = body.mapping.to_scene(particles.positions)
         return FittedState(
             state.sequence_id,

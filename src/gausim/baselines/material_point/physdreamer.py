@@ -6,7 +6,6 @@ fitted parameters are a velocity field per sequence and a field of Young's modul
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Unpack, cast
@@ -74,7 +73,6 @@ class PhysDreamer(MaterialPoints):
         modulus: ModulusField,
         velocity_resolution: int = 24,
         velocity_scale: float = 0.18,
-        rayleigh: float | None = None,
         **recorded: Unpack[Recorded],
     ) -> None:
         """Places the driving particles.
@@ -87,8 +85,6 @@ class PhysDreamer(MaterialPoints):
             modulus: the field of E.
             velocity_resolution: resolution of the planes of the velocity fields.
             velocity_scale: factor on their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
-            rayleigh: initial rate at which all matter loses velocity, the mass-proportional term of Rayleigh damping
-                [1 / s], fitted per object; None: no damping, as in the original.
 
         Raises:
             ConfigError: a number out of range, or Warp is not installed.
@@ -97,8 +93,6 @@ class PhysDreamer(MaterialPoints):
         cells = discretisation.cells
         if particles < 8 or cells < 4:
             raise ConfigError(f"model.method: expected particles >= 8 and cells >= 4, got {particles} and {cells}.")
-        if rayleigh is not None and not 0 < rayleigh < math.inf:
-            raise ConfigError(f"model.method.rayleigh: expected null or a rate above 0 [1 / s], got {rayleigh}.")
         self.most, self.cells, self.field = particles, cells, modulus
         self.initial = require_modulus(material.young_modulus)
         domain = Domain(SIDE, SIZE, round(SIZE * cells), discretisation)
@@ -117,8 +111,6 @@ class PhysDreamer(MaterialPoints):
             velocity_scale=velocity_scale,
         )
         self.modulus_field = nn.ModuleList(TriPlaneField(modulus.resolution) for _ in self.scenes)
-        rates = [] if rayleigh is None else [math.log10(rayleigh)] * len(self.scenes)
-        self.damping = nn.ParameterList(torch.tensor(rate) for rate in rates)  # log10 of the rates
 
     @staticmethod
     def _bound(fps: float, substeps: int, material: Material, domain: Domain) -> float:
@@ -133,39 +125,21 @@ class PhysDreamer(MaterialPoints):
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the driving particles [simulation units]."""
-        return self.modulus_at(scene_id, self.body(scene_id).places)
-
-    def modulus_at(self, scene_id: int, places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Young's modulus at any points [simulation units].
-
-        Args:
-            scene_id: the object.
-            places: coordinates from :meth:`MaterialPoints.places`.
-        """
-        f = self.field.scale * self.modulus_field[scene_id](places)[:, 0]
+        f = self.field.scale * self.modulus_field[scene_id](self.body(scene_id).places)[:, 0]
         return (self.initial * torch.exp(f)).clamp(LEAST_MODULUS, self.greatest[scene_id])
 
-    def kept(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """Fraction of the velocity that Rayleigh damping leaves in a frame: exp(-rate / fps)."""
-        return torch.exp(-(10 ** self.damping[scene_id]) / self.fps[scene_id]) if len(self.damping) else None
-
     def notes(self) -> tuple[str, ...]:
-        """Differences from the original, and the fitted moduli and damping."""
+        """Differences from the original, and the fitted moduli."""
         smaller = f" on {self.cells} cells per unit instead of {CELLS}" if self.cells < CELLS else ""
         return (
             f"PhysDreamer without its diffusion prior: fitted to the calibrated videos{smaller}; the original takes "
             f"{SUBSTEPS} substeps per frame and has a particle for 10 to 25 kernels.",
             *(f"{self.description(i)}; it began with {self.initial:.3g}." for i in range(len(self.scenes))),
-            *(
-                f"{scene.name}: a fitted Rayleigh damping of {10 ** rate.item():.2g} / s, which the original lacks."
-                for scene, rate in zip(self.scenes, self.damping, strict=False)
-            ),
         )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
-        """``velocity`` per sequence; ``modulus`` and, if fitted, ``damping`` per object."""
-        own = {"damping": list(self.damping)} if len(self.damping) else {}
-        return {**super().parameter_groups(), "modulus": list(self.modulus_field.parameters()), **own}
+        """``velocity`` per sequence; ``modulus`` per object."""
+        return {**super().parameter_groups(), "modulus": list(self.modulus_field.parameters())}
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """``velocity_variation`` and ``modulus_variation``: of the planes of the fields."""

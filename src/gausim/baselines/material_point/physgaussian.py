@@ -1,8 +1,8 @@
 """Forward simulation by the material point method with a given elastic material: PhysGaussian (Xie et al., CVPR 2024).
 
 Every opaque kernel is a particle and deforms with it: S = F S_0 F^T. The material is not identified: Young's modulus
-comes from the configuration, or from a run of physdreamer (``init_from``). The original has no initial velocity of a
-recorded sequence; here a velocity field per sequence is fitted to its first frames, taken over from that run, or zero.
+comes from the configuration. The original has no initial velocity of a recorded sequence; here a velocity field per
+sequence is fitted to its first frames, or zero.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ from typing import Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from gausim.baselines.fitted import Recorded
 from gausim.baselines.material_point.driven import Driven, opaque
 from gausim.baselines.material_point.method import Discretisation, Domain, MaterialPoints, require_modulus
-from gausim.baselines.material_point.physdreamer import PhysDreamer
 from gausim.baselines.mpm import Material
-from gausim.core import ConfigError, GaussianScene
+from gausim.core import GaussianScene
 
 # Values of the original: the scene's longest side is 1, 50 cells over a domain of edge 2, 100 substeps per frame.
 SIDE, SIZE, CELLS, SUBSTEPS = 1.0, 2.0, 50, 100
@@ -74,43 +73,6 @@ class PhysGaussian(MaterialPoints):
         """Young's modulus of the particles [simulation units]."""
         return self.get_buffer(f"young_{scene_id}")
 
-    @torch.no_grad()
-    def take_over(self, other: object) -> None:
-        """Copies the moduli and velocities that PhysDreamer fitted to the same scenes and sequences.
-
-        Raises:
-            ConfigError: ``other`` is no PhysDreamer, or has other scenes, sequences or shapes of velocity fields.
-        """
-        if not isinstance(other, PhysDreamer):
-            raise ConfigError(
-                "init_from: physgaussian takes over what physdreamer has found, but that run is of "
-                f"{getattr(other, 'name', 'a simulator')}. Name a run of model=physdreamer."
-            )
-        self._require_same_data(other)
-        self.velocity.load_state_dict(other.velocity.state_dict())
-        if self.shift is not None and other.shift is not None:
-            self.shift.copy_(other.shift)
-        for scene_id in range(len(self.scenes)):
-            found = other.modulus_at(scene_id, self.body(scene_id).places)
-            stretched = self.domain.side / other.domain.side
-            self.modulus(scene_id).copy_(found * stretched**2 * self.material.density / other.material.density)
-
-    def _require_same_data(self, other: PhysDreamer) -> None:
-        """Raises ConfigError where the velocities of ``other`` do not belong to the same scenes and sequences."""
-        here, there = (
-            ([s.name for s in m.scenes], m.scene_of_sequence, m.velocity_scale, _shapes(m.velocity))
-            for m in (self, other)
-        )
-        same = here == there and all(
-            a.count == b.count and torch.equal(a.means, b.means) for a, b in zip(self.scenes, other.scenes, strict=True)
-        )
-        if not same:
-            raise ConfigError(
-                "init_from: expected a run on the same scenes and sequences with the same velocity_resolution and "
-                f"velocity_scale, got {there[0]} with {len(there[1])} sequences (here {here[0]} with {len(here[1])}). "
-                "Train both with the same data and model.method.velocity_*."
-            )
-
     def notes(self) -> tuple[str, ...]:
         """The note that the material is not identified, and differences from the original."""
         return (
@@ -118,7 +80,3 @@ class PhysGaussian(MaterialPoints):
             f"sequence begins either, and takes {CELLS} cells (here {self.domain.cells}) and {SUBSTEPS} substeps.",
             *(f"{self.description(i)}." for i in range(len(self.scenes))),
         )
-
-
-def _shapes(module: nn.Module) -> list[tuple[int, ...]]:
-    return [tuple(p.shape) for p in module.parameters()]

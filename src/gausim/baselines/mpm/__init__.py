@@ -2,8 +2,8 @@
 
 Warp is imported when the first solver is made, not before. Elastic particles that move for a frame:
 
-    solver = MPMSolver(Particles.create(x, grid=grid, density=200.0), Material(), grid, TimeStep(1 / 24))
-    state = solver.advance(ParticleState.at_rest(x, velocities), frame=0)
+    solver = MPMSolver(Particles.create(x, grid=grid, density=200.0, pinned=pinned), Material(), grid, TimeStep(1 / 24))
+    state = solver.advance(ParticleState.at_rest(x, velocities), frame=0, young_modulus=E)
 """
 
 from gausim.baselines.mpm.config import Grid, Material, Slope, TimeStep

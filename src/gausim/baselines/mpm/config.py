@@ -80,7 +80,6 @@ class TimeStep:
     """Division of a frame into substeps."""
 
     frame_time: float = 1 / 30  # duration of a frame [s]
-    substeps: int | None = None  # substeps per frame; None derives the smallest number within the bound
     # c of the bound dt < c dx / sqrt(E / rho). 0.3 is safe for nu up to 0.45, where pressure waves are 1.9 times
     # as fast as sqrt(E / rho); measured, 0.5 is stable up to 0.4 and 0.7 up to 0.3
     courant: float = 0.3
@@ -88,20 +87,18 @@ class TimeStep:
     def __post_init__(self) -> None:
         if not 0 < self.frame_time < math.inf:
             raise ConfigError(f"frame_time: expected a positive duration [s], got {self.frame_time}.")
-        if self.substeps is not None and self.substeps < 1:
-            raise ConfigError(f"substeps: expected at least 1 or none, got {self.substeps}.")
         if not 0 < self.courant <= 1:
             raise ConfigError(f"courant: expected a number in (0, 1], got {self.courant}.")
 
     def count(
         self, dx: float, young_modulus: Float[Tensor, " N"], density: Float[Tensor, " N"], poisson_ratio: float
     ) -> int:
-        """Substeps per frame: the given number, or the smallest with dt < c dx / sqrt(E / rho) for all particles.
+        """Substeps per frame: the smallest number with dt < c dx / sqrt(E / rho) for all particles.
 
         For nu > 0.45, sqrt(E / rho) is multiplied by the speed of pressure waves relative to that at 0.45.
 
         Raises:
-            ConfigError: the given number violates the bound, or a modulus is not a positive number.
+            ConfigError: a modulus is not a positive number.
         """
         speed = float((young_modulus.detach() / density).amax()) ** 0.5 if len(density) else 0.0
         speed *= max(1.0, pressure_wave(poisson_ratio) / pressure_wave(COVERED_POISSON_RATIO))
@@ -111,14 +108,4 @@ class TimeStep:
                 f"young_modulus: expected positive numbers, got {least:.4g} .. (rho c^2, c = {speed:.4g})."
             )
         bound = self.courant * dx / speed if speed else math.inf
-        needed = math.floor(self.frame_time / bound) + 1
-        if self.substeps is None:
-            return needed
-        if self.substeps < needed:
-            raise ConfigError(
-                f"substeps: {self.substeps} per frame make dt = {self.frame_time / self.substeps:.3g} s, but the "
-                f"stiffest particle (sqrt(E / rho) = {speed:.4g}) on cells of {dx:.4g} needs dt < c dx / sqrt(E / rho) "
-                f"= {bound:.3g} s (c = {self.courant}). Give at least {needed} substeps, none to derive them, a "
-                "coarser grid, or a softer or denser material."
-            )
-        return self.substeps
+        return math.floor(self.frame_time / bound) + 1

@@ -60,20 +60,16 @@ class Particles:
         grid: Grid,
         density: float,
         volume: Float[Tensor, " N"] | None = None,
-        pinned: Bool[Tensor, " N"] | None = None,
+        pinned: Bool[Tensor, " N"],
     ) -> Particles:
-        """Particles at rest; without ``volume`` the particles in a cell divide its volume equally.
+        """Particles at rest; without ``volume`` those in a cell divide its volume equally.
 
         Raises:
             DivergenceError: a particle lies outside the domain.
         """
         require_inside(positions, grid, "at rest")
-        if volume is None:
-            volume = particle_volumes(positions, grid)
-        volume = volume.float()
+        volume = particle_volumes(positions, grid) if volume is None else volume.float()
         nodes = torch.zeros((grid.cells + 1,) * 3, dtype=torch.bool, device=positions.device)
-        if pinned is None:
-            pinned = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
         if pinned.any():
             held = node_volumes(positions[pinned], volume[pinned], grid)
             nodes = (held > 0) & (held > HALF * node_volumes(positions[~pinned], volume[~pinned], grid))

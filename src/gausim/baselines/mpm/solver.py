@@ -92,30 +92,21 @@ class MPMSolver:
         self._substeps = Substeps(particles, material, grid)
 
     def substeps(self, young_modulus: Float[Tensor, " N"]) -> int:
-        """Substeps per frame for these moduli.
-
-        Raises:
-            ConfigError: the configured number violates the bound of the time step.
-        """
+        """Substeps per frame for these moduli."""
         density = self.particles.mass / self.particles.volume
         return self.step.count(self.grid.dx, young_modulus, density, self.material.poisson_ratio)
 
-    def advance(
-        self, state: ParticleState, frame: int, *, young_modulus: Float[Tensor, " N"] | None = None
-    ) -> ParticleState:
+    def advance(self, state: ParticleState, frame: int, *, young_modulus: Float[Tensor, " N"]) -> ParticleState:
         """The state at the end of a frame.
 
         Args:
             state: the state at its start.
             frame: its number, counted from 0, for error messages.
-            young_modulus: E per particle; the material's if not given.
+            young_modulus: E per particle.
 
         Raises:
-            ConfigError: the configured number of substeps violates the bound of the time step.
             DivergenceError: a particle left the domain or is not finite.
         """
-        if young_modulus is None:
-            young_modulus = state.positions.new_full((len(state.positions),), self.material.young_modulus)
         count = self.substeps(young_modulus)
         tensors = (*state.tensors(), young_modulus.float())
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)

@@ -19,10 +19,10 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted, Recorded, moved
+from gausim.baselines.fitted import Fitted, FittedState, Recorded, moved
 from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.springs import Net, move
-from gausim.core import ConfigError, DivergenceError, FittedState
+from gausim.core import ConfigError, DivergenceError
 
 # Values of the original.
 ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
@@ -30,62 +30,13 @@ ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
 MOST_SUBSTEPS = 16
 
 
-class AnchoredMotion(Fitted):
-    """Base of the methods that move anchors: kernels follow the anchors, which have a velocity in every sequence.
-
-    Velocities are in diagonals of the scene per frame and 0 for pinned anchors. Kernels turn and stretch with their
-    anchors; in the original they keep their shape.
-    """
-
-    # The body begins at rest in its pins.
-    unknown = frozenset({"free", "hands"})
-
-    def __init__(self, *, anchors: int, **recorded: Unpack[Recorded]) -> None:
-        """Places the anchors.
-
-        Args:
-            anchors: maximum number per scene.
-
-        Raises:
-            ConfigError: fewer than four anchors are allowed.
-            SceneError: the kernels of a scene occupy fewer than four grid cells.
-        """
-        super().__init__(**recorded)
-        if anchors < 4:
-            raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
-        self.most = anchors
-        self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
-        self.velocity = nn.ParameterList(torch.zeros(len(self._anchors[i].rest), 3) for i in self.scene_of_sequence)
-
-    def anchors(self, sequence_id: int) -> Anchors:
-        """The anchors of a sequence's scene."""
-        scene_id = self.scene_of_sequence[sequence_id]
-        if self._anchors[scene_id].rest.device != self._device:
-            self._anchors[scene_id] = moved(self._anchors[scene_id], self._device)
-        return self._anchors[scene_id]
-
-    def begin(self, sequence_id: int) -> FittedState:
-        """The rest state with the fitted velocity."""
-        anchors = self.anchors(sequence_id)
-        return self.state(sequence_id, 0, anchors.rest, self.velocity[sequence_id] * anchors.free)
-
-    def state(self, sequence_id: int, frame: int, x: Float[Tensor, "A 3"], v: Float[Tensor, "A 3"]) -> FittedState:
-        """The state of the kernels for anchors at ``x`` with velocities ``v``."""
-        anchors = self.anchors(sequence_id)
-        displacement = x - anchors.rest
-        turned = anchors.deformation_gradients(displacement)
-        return FittedState(sequence_id, frame, anchors.positions(displacement), *turned, (x, v))
-
-    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
-        """``velocity``, one per sequence."""
-        return {"velocity": list(self.velocity)}
-
-
-class SpringMass(AnchoredMotion):
+class SpringMass(Fitted):
     """Spring-Gaus: anchors of mass 1 joined by springs, without gravity, pinned where the object is.
 
     A spring between a and b has kappa = att 10^((k_a + k_b) / 2) / L_0 and drag att damping / L_0 (lengths in
     diagonals of the scene, times in seconds); :mod:`gausim.baselines.spring_gaus.springs` has the law and att.
+    Velocities are in diagonals per frame and 0 for pinned anchors. Kernels follow, turn and stretch with their anchors;
+    in the original they keep their shape.
     """
 
     name = "spring_mass"
@@ -116,13 +67,17 @@ class SpringMass(AnchoredMotion):
             ConfigError: a number out of range.
             SceneError: too few anchors.
         """
-        super().__init__(anchors=anchors, **recorded)
+        super().__init__(**recorded)
+        if anchors < 4:
+            raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
         if min(neighbours, substeps) < 1 or damping <= 0 or period <= 0:
             raise ConfigError(
                 "model.method: expected neighbours, substeps >= 1 and damping, period > 0, got "
                 f"{neighbours}, {substeps}, {damping} and {period}."
             )
-        self.neighbours, self.substeps = neighbours, substeps
+        self.most, self.neighbours, self.substeps = anchors, neighbours, substeps
+        self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
+        self.velocity = nn.ParameterList(torch.zeros(len(self._anchors[i].rest), 3) for i in self.scene_of_sequence)
         self._nets = [Net.of(a.rest, a.pinned, neighbours) for a in self._anchors]
         self.attenuation = nn.ParameterList(torch.zeros(()) for _ in self.scenes)
         self.damping = nn.ParameterList(torch.tensor(math.log10(damping)) for _ in self.scenes)
@@ -144,6 +99,25 @@ class SpringMass(AnchoredMotion):
             if here < full
         ]
         return (f"Spring-Gaus with at most {', '.join(smaller)}.",) if smaller else ()
+
+    def anchors(self, sequence_id: int) -> Anchors:
+        """The anchors of a sequence's scene."""
+        scene_id = self.scene_of_sequence[sequence_id]
+        if self._anchors[scene_id].rest.device != self._device:
+            self._anchors[scene_id] = moved(self._anchors[scene_id], self._device)
+        return self._anchors[scene_id]
+
+    def begin(self, sequence_id: int) -> FittedState:
+        """The rest state with the fitted velocity."""
+        anchors = self.anchors(sequence_id)
+        return self.state(sequence_id, 0, anchors.rest, self.velocity[sequence_id] * anchors.free)
+
+    def state(self, sequence_id: int, frame: int, x: Float[Tensor, "A 3"], v: Float[Tensor, "A 3"]) -> FittedState:
+        """The state of the kernels for anchors at ``x`` with velocities ``v``."""
+        anchors = self.anchors(sequence_id)
+        displacement = x - anchors.rest
+        turned = anchors.deformation_gradients(displacement)
+        return FittedState(sequence_id, frame, anchors.positions(displacement), *turned, (x, v))
 
     def springs(self, scene_id: int) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"]]:
         """Stiffness kappa [1 / frames^2] and drag [1 / frames] of every spring of a scene."""
@@ -184,7 +158,7 @@ class SpringMass(AnchoredMotion):
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``velocity`` per sequence; ``stiffness``, ``attenuation`` and ``damping`` per object."""
         return {
-            **super().parameter_groups(),
+            "velocity": list(self.velocity),
             "stiffness": list(self.stiffness),
             "attenuation": list(self.attenuation),
             "damping": list(self.damping),

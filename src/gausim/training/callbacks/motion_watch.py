@@ -1,4 +1,4 @@
-"""Motion errors during training: on unseen frames, per level, in frequency and phase."""
+"""Motion errors during training, on seen and unseen frames."""
 
 from __future__ import annotations
 
@@ -12,21 +12,15 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
-from gausim.data.objects import ObjectData
-from gausim.data.pretraining import BodyData
 from gausim.data.records import GroundTruth
 from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
-from gausim.results.diagnosis import Diagnosis, numbers, read_diagnosis
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.points import attach_points
 from gausim.training.table import Table, short
-
-METHOD = "prediction"
-LEVELS = 3
 
 
 class MotionWatch(Callback):
@@ -37,11 +31,7 @@ class MotionWatch(Callback):
     go to ``motion.csv`` of the run, means over objects to every logger.
     """
 
-    COLUMNS = (
-        "epoch", "step", "object", "error_seen", "error_unseen", "gap", "energy_seen", "energy_unseen",
-        "velocity_cosine", "frequency_error", "damping_ratio", "phase_seen", "phase_unseen",
-        *(f"error_level_{level}" for level in range(1, LEVELS + 1)),
-    )  # fmt: skip
+    COLUMNS = ("epoch", "step", "object", "error_seen", "error_unseen", "gap", "energy_seen", "energy_unseen")
 
     def __init__(self, *, every_epochs: int = 10, sequences: int = 4) -> None:
         """Measures every ``every_epochs`` epochs (0: never) and after the last, on ``sequences`` of each object."""
@@ -76,18 +66,17 @@ class MotionWatch(Callback):
 
     def _measure(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first, data = {}, 0, training_data(trainer)
-        units_of_kernels = getattr(module.model, "units_of_kernels", lambda scene_id: ())
         for scene_id, item in enumerate(data.objects):
             found = list(self._predicted(module, item, scene_id, first)) if scene_id in data.watched else []
             first += len(item.sequences)
             if found:
-                rows[item.name] = figures(found, item, units_of_kernels(scene_id))
+                rows[item.name] = figures(found, item.train_frames.stop)
         return rows
 
     def _predicted(
         self, module: GausSimModule, item: Any, scene_id: int, first: int
-    ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
-        """True and predicted motion of each sequence, and the kernels that the points are attached to.
+    ) -> Iterator[tuple[GroundTruth, Tensor]]:
+        """True and predicted motion of each sequence.
 
         ``item`` is the object, an ``ObjectData`` or a ``BodyData``.
         """
@@ -107,18 +96,14 @@ class MotionWatch(Callback):
             except DivergenceError as error:
                 module.print(f"motion of {item.name}/{record.name} is not told: {error}")
                 continue
-            yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions), attached
+            yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions)
 
 
-def figures(
-    found: Sequence[tuple[GroundTruth, Tensor, Tensor]], item: ObjectData | BodyData, units: Sequence[Tensor]
-) -> dict[str, float]:
-    """The figures of one object, without those that cannot be computed."""
-    unseen, diagnosis = item.train_frames.stop, Diagnosis(item.fps)
+def figures(found: Sequence[tuple[GroundTruth, Tensor]], unseen: int) -> dict[str, float]:
+    """The figures of one object, without those that cannot be computed; ``unseen`` is the first unseen frame."""
     # Prediction and reference by frame, over all sequences: mean distance from the truth, and motion energy.
     errors, energies = [], []
-    for truth, points, attached in found:
-        diagnosis.add(truth.positions, truth.rest, {METHOD: points}, {METHOD: [unit[attached] for unit in units]})
+    for truth, points in found:
         static = truth.rest.expand_as(truth.positions)
         errors.append([(x - truth.positions).norm(dim=-1).mean(-1).cpu().double().numpy() for x in (points, static)])
         energies.append([motion_energy(x).cpu().double().numpy() for x in (points, truth.positions)])
@@ -126,15 +111,6 @@ def figures(
     row["gap"] = row["error_unseen"] - row["error_seen"]
     row["energy_seen"] = _ratio(energies, slice(0, unseen - 1))
     row["energy_unseen"] = _ratio(energies, slice(unseen - 1, None))
-    read = read_diagnosis(diagnosis.summary(), unseen)
-    if read is not None:
-        own = read.rows[METHOD]
-        levels, (cosine,) = (numbers(v) for v in (own.level_errors[:LEVELS], [own.velocity_cosine]))
-        row |= {f"error_level_{i}": float(v) for i, v in enumerate(levels, 1)}
-        row["velocity_cosine"] = float(cosine)
-        row["frequency_error"] = read.frequency_error(METHOD)
-        row["damping_ratio"] = read.damping_ratio(METHOD)
-        row["phase_seen"], row["phase_unseen"] = (read.phase(METHOD, seen=seen) for seen in (True, False))
     return {name: value for name, value in row.items() if np.isfinite(value)}
 
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float
 from lightning.pytorch import Callback, LightningModule, Trainer
-from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.dataset import SequenceSample
@@ -23,16 +19,13 @@ from gausim.training.dashboards import log_media
 from gausim.training.media import Clip, forget_media, safe_name, write_media
 from gausim.training.module import GausSimModule
 
-COLUMNS = ["object", "sequence", "camera", "T", "l2 x1000", "static x1000", "l2 / static", "motion energy", "seconds"]
-PREDICTION, STATIC = "prediction", "static"
-
 
 class Panels(Callback):
     """Renders predictions of the first sequence of every object in its first training camera.
 
-    Frames 0..``t_max`` of the plan are predicted, whatever the current T; unseen frames are not read. Videos,
-    pictures and tables go to ``panels/`` of the run and to every logger that shows media, errors as numbers to every
-    logger. There is no effect on training.
+    Frames 0..``t_max`` of the plan are predicted, whatever the current T; unseen frames are not read. Videos and
+    pictures go to ``panels/`` of the run and to every logger that shows media, errors as numbers to every logger. There
+    is no effect on training.
     """
 
     def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
@@ -54,28 +47,22 @@ class Panels(Callback):
                 self._show(trainer, pl_module)
 
     def _show(self, trainer: Trainer, module: GausSimModule) -> None:
-        clips, rows = [], []
-        numbers: dict[str, float] = {}
+        clips, numbers = [], dict[str, float]()
         for sample in self._samples(trainer, module):
-            began = time.monotonic()
             try:
-                clip, figures = _clip(module, sample)
+                clip, own, ratio = _clip(module, sample)
             except DivergenceError as error:
                 module.print(f"no panel of {sample.object_name} at step {trainer.global_step}: {error}")
                 continue
-            steps = int(module.last_stats.get("steps", 0))
-            names = [sample.object_name, sample.sequence_name, sample.cameras.names[0], str(steps)]
-            shown = [f"{value:.4g}" for value in (*figures.values(), time.monotonic() - began)]
             clips.append(clip)
-            rows.append([*names, *shown])
             prefix = f"objects/{sample.object_name}"
-            numbers |= {f"{prefix}/l2": figures["l2"] / 1000, f"{prefix}/ratio_static": figures["ratio"]}
+            numbers |= {f"{prefix}/l2": own, f"{prefix}/ratio_static": ratio}
         if not clips:
             return
-        media = write_media(Path(trainer.default_root_dir), trainer.global_step, clips, COLUMNS, rows)
+        folder = write_media(Path(trainer.default_root_dir), trainer.global_step, clips)
         for logger in trainer.loggers:
             logger.log_metrics(numbers, step=trainer.global_step)
-            log_media(logger, media)
+            log_media(logger, folder, trainer.global_step)
 
     def _samples(self, trainer: Trainer, module: GausSimModule) -> list[SequenceSample]:
         data = training_data(trainer)
@@ -87,30 +74,18 @@ class Panels(Callback):
         return [data.index.sample(s, frames, data.objects[i].train_views[:1]).to(module.device) for i, s in chosen]
 
 
-def _clip(module: GausSimModule, sample: SequenceSample) -> tuple[Clip, dict[str, float]]:
-    """The media of a sequence, and its figures: l2 and static's [1e-3], their ratio, motion energy."""
+def _clip(module: GausSimModule, sample: SequenceSample) -> tuple[Clip, float, float]:
+    """The media of a sequence, its l2 over the predicted frames, and that over the static prediction's."""
     prediction = module.predict_images(sample)[:, 0].clamp(0, 1)
     if not bool(torch.isfinite(prediction).all()):
         raise DivergenceError("the predicted images are not finite")
     truth, alpha = (x[:, 0] for x in composite(sample.frames))
-    truth = truth.to(prediction)
-    mask, scale = alpha > 0, L2.scale
-    metric = L2()
-    by_frame = {
-        PREDICTION: metric.per_image(prediction, truth, mask) * scale,
-        STATIC: metric.per_image(prediction[:1].expand_as(truth), truth, mask) * scale,
-    }
-    errors = {name: values.double().cpu().numpy() for name, values in by_frame.items()}
-    own, still = (float(np.mean(errors[name][1:])) for name in (PREDICTION, STATIC))
-    moved = _energy(truth)
-    ratios = own / still if still > 0 else math.nan, _energy(prediction) / moved if moved > 0 else math.nan
-    figures = dict(zip(("l2", "static", "ratio", "energy"), (own, still, *ratios), strict=True))
+    truth, metric = truth.to(prediction), L2()
+    own, still = (
+        float(metric.per_image(images, truth, alpha > 0)[1:].double().mean())
+        for images in (prediction, prediction[:1].expand_as(truth))
+    )
     name = safe_name(sample.object_name, sample.sequence_name)
     title = f"{sample.object_name}/{sample.sequence_name} {sample.cameras.names[0]}"
     drawn = [to_bytes(images).cpu().numpy() for images in (truth, prediction)]
-    return Clip(name, title, sample.fps, drawn[0], drawn[1], errors), figures
-
-
-def _energy(images: Float[Tensor, "F H W 3"]) -> float:
-    """Squared change from frame to frame, summed."""
-    return float(images.diff(dim=0).square().sum())
+    return Clip(name, title, sample.fps, *drawn), own, own / still if still > 0 else math.nan

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import signal
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from gausim.core import ConfigError
-from gausim.runs.checkpoint import LAST_CHECKPOINT, digest
+from gausim.runs.names import LAST_CHECKPOINT
 from gausim.runs.randomness import random_state, restore_random_state
 from gausim.training.ranks.ranks import Ranks
 
@@ -76,7 +78,9 @@ class ExactResume(Callback):
         epochs: Any = trainer.fit_loop.epoch_progress.current
         at_epoch_end = epochs.processed > epochs.completed
         if self._ranks.size > 1:
-            self._ranks.check_alike(digest(checkpoint["state_dict"]), f"weights at step {trainer.global_step}")
+            weights = [x.detach().cpu().contiguous().reshape(-1) for x in checkpoint["state_dict"].values()]
+            found = hashlib.sha256(b"".join(x.view(torch.uint8).numpy().tobytes() for x in weights)).hexdigest()
+            self._ranks.check_alike(found, f"weights at step {trainer.global_step}")
         states = self._ranks.gather(random_state())
         checkpoint["resume"] = {"random": states, "over": at_epoch_end and trainer.should_stop}
 

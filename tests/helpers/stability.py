@@ -3,47 +3,32 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 from torch import Tensor
 
 from gausim.core import SimState
+from gausim.models.step.simulator import GausSim
 from gausim.nn.mode import evaluating
-
-if TYPE_CHECKING:
-    from gausim.models.step.simulator import GausSim
 
 # Rows of the Jacobian per backward pass, each in a copy of the scene.
 COPIES = 24
-# Largest number of unknowns per state for a dense Jacobian; ARPACK needs only products beyond it.
-DENSE = 1500
 
 
 def largest_eigenvalue(model: GausSim, scene_id: int) -> float:
     """Largest absolute eigenvalue of the step at rest; above 1, small motions grow.
 
-    The step maps displacements (u_t, u_{t-1}) of the finest predicted units and their kernels to (u_{t+1}, u_t).
-    Its Jacobian [[A, B], [I, 0]] over the units that are not pinned comes from automatic differentiation. The
-    energy guard of rollouts is off.
+    The step maps displacements (u_t, u_{t-1}) of the finest predicted units and their kernels to (u_{t+1}, u_t). Its
+    Jacobian [[A, B], [I, 0]] over the units that are not pinned comes from automatic differentiation.
     """
-    step = _LinearStep(model, scene_id)
-    count = step.count
-    if count <= DENSE:
-        blocks = step.rows()
-        jacobian = np.block([[blocks[:, :count], blocks[:, count:]], [np.eye(count), np.zeros((count, count))]])
-        return float(np.abs(np.linalg.eigvals(jacobian)).max())
-    operator = LinearOperator((2 * count, 2 * count), matvec=step.transposed, dtype=np.float64)
-    try:
-        values = eigs(operator, 6, which="LM", tol=1e-5, v0=np.ones(2 * count), return_eigenvectors=False)
-    except ArpackNoConvergence as unfinished:
-        values = unfinished.eigenvalues
-    return float(np.abs(values).max()) if len(values) else float("nan")
+    step = LinearStep(model, scene_id)
+    count, blocks = step.count, step.rows()
+    jacobian = np.block([[blocks[:, :count], blocks[:, count:]], [np.eye(count), np.zeros((count, count))]])
+    return float(np.abs(np.linalg.eigvals(jacobian)).max())
 
 
-class _LinearStep:
+class LinearStep:
     """Products with the Jacobian of the free units' step at rest."""
 
     def __init__(self, model: GausSim, scene_id: int) -> None:
@@ -75,11 +60,3 @@ class _LinearStep:
         """[A, B] (count, 2 count)."""
         identity = torch.eye(self.count, device=self._free.device)
         return np.concatenate([self._pull(part) for part in identity.split(COPIES)])
-
-    def transposed(self, vector: np.ndarray) -> np.ndarray:
-        """J^T v, whose eigenvalues are those of J."""
-        first, second = vector.ravel()[: self.count], vector.ravel()[self.count :]
-        weights = torch.from_numpy(first.astype(np.float32))[None].to(self._free.device)
-        pulled = self._pull(weights)[0]
-        pulled[: self.count] += second
-        return pulled
