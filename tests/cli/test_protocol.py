@@ -164,7 +164,7 @@ def test_a_damaged_record_of_looks_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "test.json"
     assert read_looks(path) == []
     path.write_text('{"schema": "gausim.test/2", "looks": []}')
-    with pytest.raises(RunError, match=r"test\.json: expected the looks"):
+    with pytest.raises(RunError, match=r"test\.json: expected the record"):
         read_looks(path)
     path.write_text("{}")
     with pytest.raises(RunError, match=r"test\.json: expected the record"):
@@ -182,7 +182,7 @@ def test_data_without_a_test_part_know_no_look(toy: Path, run: Path) -> None:
     with pytest.raises(ConfigError, match=r"--test, --trials: .* trained on data without a test part"):
         evaluate.main([str(run), "--test", "--trials", "1"])
     declare("seq_001")
-    with pytest.raises(ConfigError, match="--trials: declares the trials before a look"):
+    with pytest.raises(ConfigError, match="--trials: declares the trials before a test evaluation"):
         evaluate.main([str(run), "--trials", "1"])
 
 
