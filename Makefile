@@ -91,6 +91,7 @@ benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at ti
 demo: $(DEMO_DATA)/.made ## From nothing to a simulator that predicts: install, make an object, train, evaluate, and a page about it
 	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=1
 	$(BIN)/gausim evaluate outputs/demo/seed_0
+	$(BIN)/gausim export outputs/demo/seed_0 --format page --out outputs/demo/seed_0/page.html
 	$(BIN)/gausim report outputs/demo/seed_0
 
 $(DEMO_DATA)/.made: | install
