@@ -14,7 +14,15 @@ import numpy as np
 
 from gausim.core.errors import DataError
 from gausim.io.files import natural, write_durably
-from gausim.io.pixels import ORIENTATION, QUARTER_TURNS, decode, decode_tiff, exif_turned, palette_indices, read_header
+from gausim.io.pixels import (
+    ORIENTATION,
+    QUARTER_TURNS,
+    decode,
+    exif_turned,
+    is_premultiplied,
+    palette_indices,
+    read_header,
+)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # Pictures that no stage reads.
@@ -38,6 +46,7 @@ class Photo:
     focal: float | None  # by its EXIF data, None where there are none [pixels]
     orientation: int = 1  # by its EXIF data
     upright: bool = False  # whether the picture is turned as the orientation says
+    mask: Path | None = None  # a picture of its alpha, of its pixels as stored
 
     def turned(self) -> Photo:
         """The same photo with pixels as its EXIF data turn it."""
@@ -47,6 +56,9 @@ class Photo:
     def read(self) -> np.ndarray:
         """(H, W, 4) uint8 RGBA with straight alpha."""
         pixels = read_picture(self.path)
+        if self.mask is not None:
+            alpha = read_mask(self.mask, (pixels.shape[1], pixels.shape[0]), self.path.name)
+            pixels = np.dstack((pixels[..., :3], np.minimum(alpha, pixels[..., 3])))
         pixels = exif_turned(pixels, self.orientation) if self.upright else pixels
         if pixels.shape[:2] != (self.height, self.width):
             found = f"{pixels.shape[1]}x{pixels.shape[0]}"
@@ -85,7 +97,7 @@ def open_photo(path: Path, name: str) -> Photo:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Decodes a picture to (H, W, 4) uint8 RGBA with straight alpha, as stored; opaque where the file has no alpha."""
+    """Decodes a picture to (H, W, 4) uint8 RGBA with straight alpha, not turned; opaque where the file has no alpha."""
     pixels = _stored(path)
     if pixels.dtype == np.uint16:
         pixels = np.round(pixels / 257.0).astype(np.uint8)
@@ -95,15 +107,13 @@ def read_picture(path: Path) -> np.ndarray:
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGBA))
     if pixels.shape[2] == 2:  # grey with alpha
         return np.ascontiguousarray(pixels[..., [0, 0, 0, 1]])
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGBA if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
+    rgba = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGBA if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
+    return straight(rgba.astype(np.float32)) if is_premultiplied(rgba) else rgba
 
 
 def _stored(path: Path) -> np.ndarray:
     """Pixels as stored, in the channels and the type of the file (BGR)."""
-    header = read_header(path)
-    turned = header is not None and path.suffix.lower() in (".tif", ".tiff") and header.exif.get(ORIENTATION, 1) != 1
-    plain = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = decode_tiff(path) if turned else decode(path, plain)
+    pixels = decode(path)
     if pixels is None:
         what = (
             "cannot be decoded as a picture. Export it again as PNG" if path.is_file() else "no such file. Restore it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from gausim.cli.output import bars as plain_bars
+from gausim.runs.processes import end_with
 
 # Columns of a bar: step, number done, total.
 Tick = Callable[[str, int, int], None]
@@ -59,7 +61,8 @@ def each(work: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: 
         return
     # Not forked: a fork of a process with live threads (torch, rich) can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(1, len(jobs))), mp_context=context, initializer=_one_thread) as pool:
+    with ProcessPoolExecutor(min(workers, max(1, len(jobs))), mp_context=context, initializer=_begin_worker,
+                             initargs=(os.getpid(),)) as pool:  # fmt: skip
         pending = [pool.submit(work, *job) for job in jobs]
         for number, done in enumerate(as_completed(pending), 1):
             if done.exception() is not None:
@@ -68,7 +71,8 @@ def each(work: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], *, workers: 
             tick(step, number, len(jobs))
 
 
-def _one_thread() -> None:
+def _begin_worker(parent: int) -> None:
     import torch
 
+    end_with(parent)
     torch.set_num_threads(1)

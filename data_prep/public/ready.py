@@ -24,7 +24,7 @@ from data_prep.public.scene import ImportOptions, Motion, Picture, PublicObject,
 from data_prep.ready.marks import scene_files, write_scene
 from gausim.core.errors import DataError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
-from gausim.io.files import natural
+from gausim.io.files import natural, slashed
 from gausim.io.plain_json import checked
 
 _VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")
@@ -159,10 +159,11 @@ def _motion(root: Path, name: str, seen: dict[str, ColmapImage], model: ColmapMo
 
 
 def _still(root: Path, model: ColmapModel, image: ColmapImage, masks: Path) -> tuple[View, Picture]:
-    path = root / "images" / image.name
-    shot: Posed = posed_image(open_photo(path, image.name), model, image)
+    name = slashed(root / "images", image.name)
+    path = root / "images" / name
+    shot: Posed = posed_image(open_photo(path, name), model, image)
     view, straight = pinhole(path.stem, shot)
-    return view, flattened(path, straight, view.size, _mask(masks, Path(image.name)))
+    return view, flattened(path, straight, view.size, _mask(masks, Path(name)))
 
 
 def _mask(folder: Path, name: Path) -> Path | None:

@@ -161,6 +161,46 @@ def test_films_without_poses_are_left_out_by_name(tmp_path: Path) -> None:
     assert list(results["sequences"]) == ["seq_0"] and results["sequences_without_poses"] == {"seq_1": ["cam_9"]}
 
 
+def disc_masks(root: Path) -> dict[str, np.ndarray]:
+    """A mask per still of a rig, in different encodings and under names of different programs."""
+    disc = np.hypot(*np.mgrid[-24:24, -32:32]) < 15
+    (root / "masks").mkdir()
+    cv2.imwrite(str(root / "masks/still_0.png"), disc.astype(np.uint8))
+    cv2.imwrite(str(root / "masks/still_1.jpg"), 255 * (~disc).astype(np.uint8))
+    data = json.loads((root / "transforms.json").read_text())
+    data["frames"][0]["mask_path"], data["frames"][1]["mask_path"] = "masks\\still_0.png", "./masks/still_1"
+    (root / "transforms.json").write_text(json.dumps(data))
+    return {"still_0.png": disc, "still_1.png": ~disc}
+
+
+def test_masks_of_a_transforms_json_become_alpha(tmp_path: Path) -> None:
+    path, out = rig(tmp_path / "in"), tmp_path / "out"
+    known = disc_masks(path.parent)
+    find_poses(out, Sources(transforms=path), mapping=OPTIONS)
+    for name, mask in known.items():  # the lens moves their edges
+        alpha = cv2.imread(str(out / "images" / name), cv2.IMREAD_UNCHANGED)[..., 3]
+        assert ((alpha > 127) != mask).mean() < 0.03 and alpha.min() == 0 and alpha.max() == 255
+    assert cv2.imread(str(out / "images/cam_0.png"), cv2.IMREAD_UNCHANGED).shape[2] == 3
+    cv2.imwrite(str(path.parent / "masks/still_0.png"), np.ones((48, 64), np.uint8))
+    with pytest.raises(DataError, match="other inputs"):
+        find_poses(out, Sources(transforms=path), mapping=OPTIONS)
+    (path.parent / "masks/still_1.jpg").unlink()
+    with pytest.raises(DataError, match=r"masks/still_1\.png: not found"):
+        find_poses(tmp_path / "other", Sources(transforms=path), mapping=OPTIONS)
+
+
+def test_names_of_windows_find_their_photos(tmp_path: Path) -> None:
+    cameras, images, points = colmap_files.small_model(size=(WIDTH, HEIGHT))
+    images = {n: (f"left\\photo_{n}.png", *i[1:]) for n, i in images.items()}
+    colmap_files.write_binary(tmp_path / "model", cameras, images, points)
+    (tmp_path / "photos/left").mkdir(parents=True)
+    for n in images:
+        cv2.imwrite(str(tmp_path / f"photos/left/photo_{n}.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    sources = Sources(images=tmp_path / "photos", colmap=tmp_path / "model")
+    find_poses(tmp_path / "out", sources, mapping=OPTIONS)
+    assert len(read_transforms(tmp_path / "out/transforms.json").frames) == len(images)
+
+
 LENSES = {
     "SIMPLE_RADIAL": [0.08], "RADIAL": [0.08, -0.02], "OPENCV": [0.08, -0.02, 0.004, -0.003],
     "OPENCV_FISHEYE": [0.03, 0.01, 0.0, 0.0], "FULL_OPENCV": [0.08, -0.02, 0.004, -0.003, 0.01, 0.0, 0.0, 0.0],

@@ -85,6 +85,7 @@ FAULTS = {
     "camera of an image": ("images", " 7 photo_1", " 8 photo_1", "'camera_id'"),
     "name twice": ("images", "photo_1", "photo_0", "stands twice"),
     "name outside": ("images", "photo_1", "../photo_1", "inside the folder"),
+    "name outside on Windows": ("images", "photo_1", "..\\photo_1", "inside the folder"),
     "translation": ("images", " 4.0 7 photo_1", " nan 7 photo_1", "'translation'"),
     "keypoints": ("images", "11.5 20.25 5", "11.5 20.25", "triples"),
     "keypoint": ("images", "11.5 20.25 5", "nan 20.25 5", "keypoints"),

@@ -6,7 +6,7 @@ These are COLMAP models, or ``transforms.json`` with any lens.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from gausim.io.colmap import (
     no_points,
     read_colmap,
 )  # fmt: skip
-from gausim.io.files import natural
+from gausim.io.files import natural, slashed
 from gausim.io.plain_json import read_json
 
 
@@ -118,7 +118,8 @@ def _taken_over(sources: Sources) -> tuple[tuple[list[Posed], PointTable] | None
         posed, points, files = read_lens_transforms(sources.transforms), no_points(), {"transforms": sources.transforms}
     else:
         return None, {}
-    return (posed, points), {**files, **{f"images/{shot.photo.name}": shot.photo.path for shot in posed}}
+    masks = {f"masks/{shot.photo.name}": shot.photo.mask for shot in posed if shot.photo.mask is not None}
+    return (posed, points), {**files, **{f"images/{shot.photo.name}": shot.photo.path for shot in posed}, **masks}
 
 
 def _sequences(sources: Sources) -> tuple[dict[Path, tuple[str, ...]], float | None]:
@@ -149,10 +150,10 @@ def from_model(model: ColmapModel, images: Path | Mapping[str, Photo]) -> list[P
         model: the model.
         images: the folder of the photos, or the photos by the model's names.
     """
-    photos = images if isinstance(images, Mapping) else {
-        image.name: open_photo(images / image.name, image.name) for image in model.images
-    }  # fmt: skip
-    return [posed_image(photos[image.name], model, image) for image in model.images]
+    if not isinstance(images, Mapping):
+        names = {image.name: slashed(images, image.name) for image in model.images}
+        images = {name: open_photo(images / found, found) for name, found in names.items()}
+    return [posed_image(images[image.name], model, image) for image in model.images]
 
 
 def posed_image(photo: Photo, model: ColmapModel, image: ColmapImage) -> Posed:
@@ -196,12 +197,14 @@ def read_lens_transforms(path: Path) -> list[Posed]:
     posed, names = [], set()
     for where, entry in read_entries(data, path):
         fields = lens_fields(data, entry)
-        refuse_fields(fields, where, obeyed=("is_fisheye",))
+        refuse_fields(fields, where, obeyed=("is_fisheye", "mask_path"))
         name = image_name(entry, where, path.parent)
         if name in names:
             raise DataError(f"{where}: field 'file_path' '{name}' stands twice.")
         names.add(name)
         photo = open_photo(path.parent / name, name.removeprefix("./"))
+        if entry.get("mask_path"):
+            photo = replace(photo, mask=path.parent / image_name(entry, where, path.parent, "mask_path"))
         size = size_field(fields, where) or (photo.width, photo.height)
         k = pinhole_of(fields, size, where)
         viewmat = viewmat_of(entry, where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -13,6 +14,8 @@ from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
+
+logger = logging.getLogger(__name__)
 
 EPILOG = """States are fitted to the motion tracked in the videos, then to the images. The result is a run of its
 own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the state before frame 0 of each sequence,
@@ -128,9 +131,12 @@ def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> l
     """Entries of data.root: the stores' objects that are in the run, each with the rest scene of its training."""
     from gausim.compose.config import instantiate
     from gausim.data.objects import ObjectData, find_objects
+    from gausim.runs.data_print import changed_files
 
-    data = {**located(run, config["data"], {}), "sequences": None}
-    known: dict[str, ObjectData] = {item.name: item for item in instantiate(data).objects}
+    data = located(run, config["data"], {})
+    if stores is None and (changed := changed_files(run, instantiate(data).objects)):
+        logger.warning("%s", changed)
+    known: dict[str, ObjectData] = {item.name: item for item in instantiate({**data, "sequences": None}).objects}
     if stores is None:
         return [_entry(item.root, item) for item in known.values()]
     found = [ObjectData(root) for store in stores for root in find_objects(store)]

@@ -42,7 +42,9 @@ def _evaluate(run: RunDirectory) -> None:
     if not is_first():
         return
     part = run.config()["data"].get("part")
-    command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path), *["--test"] * (part == "test")]
+    begin = f"from gausim.runs.processes import end_with; end_with({os.getpid()}); "
+    begin += "from gausim.cli.main import main; raise SystemExit(main())"
+    command = [sys.executable, "-c", begin, "evaluate", str(run.path), *["--test"] * (part == "test")]
     status = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}).returncode
     if status:
         raise RunError(

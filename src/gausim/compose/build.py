@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from gausim.render.auto import AutoRenderer
 from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
+from gausim.runs.data_print import changed_files
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
 from gausim.training.method import SharedSimulator
@@ -32,6 +34,8 @@ from gausim.training.module import GausSimModule
 from gausim.training.plan import DataFacts, TrainingPlan
 from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources
+
+logger = logging.getLogger(__name__)
 
 CORPUS = "gausim.data.pretraining.CorpusDataModule"
 
@@ -219,6 +223,8 @@ def _load(
     loaded = read_checkpoint(directory.path / checkpoint)
     config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
+    if datamodule.has_videos and (changed := changed_files(directory.path, datamodule.objects)):
+        logger.warning("%s What follows is of the data as they are now.", changed)
     check_scenes(loaded, module.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)

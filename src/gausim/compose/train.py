@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -14,15 +15,19 @@ from gausim.baselines import fitting
 from gausim.baselines.fitting import FittedModule
 from gausim.compose.build import Opened, build_module
 from gausim.compose.config import instantiate
-from gausim.core import ConfigError
+from gausim.core import ConfigError, RunError
 from gausim.data.datamodule import ReadyDataModule
+from gausim.data.idle import idle_sequences
 from gausim.results.looks import TEST_PART
+from gausim.runs.data_print import changed_files, write_prints
 from gausim.runs.directory import RunDirectory
 from gausim.training import run as simulation
 from gausim.training.module import GausSimModule
 from gausim.training.ranks.launch import joined
 from gausim.training.ranks.ranks import Ranks
 from gausim.training.trainer import TrainerSettings
+
+log = logging.getLogger(__name__)
 
 # Folders of loggers within the run.
 FOLDERS: dict[str, dict[str, str]] = {
@@ -49,6 +54,8 @@ def train(opened: Opened, run: RunDirectory, *, notes: Mapping[str, Any] | None 
             resume = run.checkpoint_to_resume
         seed_everything(cfg.seed, workers=True, verbose=False)
         check_protocol(cfg, data)
+        if data.has_videos and (first or Ranks().size > 1):
+            Ranks().first(lambda: _note_data(run, data, resumed=resume is not None))
         if "joint" in str(cfg.ablation.name).split("+") and len(data.objects) == 1:
             raise ConfigError(f"ablation=joint: expected several objects, the data have {data.objects[0].name} alone.")
         module = build_module(cfg, data)
@@ -71,6 +78,16 @@ def train(opened: Opened, run: RunDirectory, *, notes: Mapping[str, Any] | None 
         facts |= notes or {}
         run.finish(facts)
         return facts
+
+
+def _note_data(run: RunDirectory, data: ReadyDataModule, *, resumed: bool) -> None:
+    """Stores the fingerprints of a new run's data; a run that goes on has to find them as they were."""
+    if not resumed:
+        write_prints(run.path, data.objects)
+        for text in idle_sequences(data.objects):
+            log.warning("%s", text)
+    elif changed := changed_files(run.path, data.objects):
+        raise RunError(f"{changed} Restore them to resume the run, or set overwrite=true.")
 
 
 def is_first() -> bool:

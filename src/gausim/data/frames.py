@@ -68,9 +68,9 @@ class PackedSource:
         """Straight-alpha RGBA of these frames and cameras, all of which exist."""
         return self._packed.read(frames, [self._columns[column] for column in columns])
 
-    def absent(self) -> list[Path]:
-        """An empty list: the header was checked against the files of the pixels."""
-        return []
+    def files(self) -> list[Path]:
+        """The header and the files of the pixels, which it was checked against."""
+        return [self._packed.folder / HEADER, *sorted(self._packed.folder.glob("view_*.npy"))]
 
 
 class ImageSource:
@@ -104,9 +104,9 @@ class ImageSource:
             self._decoded[f, v] = True
         return torch.from_numpy(self._pixels[np.ix_(list(frames), list(columns))])
 
-    def absent(self) -> list[Path]:
-        """Image files that are named but missing."""
-        return [path for row in self._paths for path in row if not path.is_file()]
+    def files(self) -> list[Path]:
+        """``transforms.json`` and the image files that it names."""
+        return [self._root / "transforms.json", *(path for row in self._paths for path in row)]
 
 
 def _frames_of_views(path: Path, frames: Sequence[PosedFrame], views: Sequence[str]) -> list[list[int]]:

@@ -117,7 +117,11 @@ class SequenceRecord:
 
     def absent(self) -> list[Path]:
         """Images that ``transforms.json`` names but that are missing."""
-        return self._source.absent()
+        return [path for path in self._source.files() if not path.is_file()]
+
+    def files(self) -> list[Path]:
+        """The files of its frames, and of its hands if there are any."""
+        return [*self._source.files(), *filter(Path.is_file, [self.root / "hands.npz"])]
 
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
         """True motion of the points with these rest positions, or None where the data set has none (real captures)."""

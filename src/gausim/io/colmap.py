@@ -205,7 +205,10 @@ def _checked_camera(where: str, camera: ColmapCamera) -> ColmapCamera:
 def _checked_image(where: str, pose: np.ndarray, image: ColmapImage, cameras: dict[int, ColmapCamera]) -> ColmapImage:
     from scipy.spatial.transform import Rotation  # a fifth of a second, which --help of the stages need not take
 
-    place, printable = PurePosixPath(image.name), all(c.isprintable() or c.isspace() for c in image.name)
+    place, printable = (
+        PurePosixPath(image.name.replace("\\", "/")),
+        all(c.isprintable() or c.isspace() for c in image.name),
+    )
     if not printable or set("\n\r\t") & set(image.name) or not place.name or place.is_absolute() or ".." in place.parts:
         raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {image.name!r:.80}.")
     if image.camera not in cameras:

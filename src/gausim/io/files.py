@@ -112,6 +112,11 @@ def safe_name(name: str, where: str) -> str:
     return name
 
 
+def slashed(folder: Path, name: str) -> str:
+    """A file's name in a folder: as it is where that file exists, else with slashes for the backslashes of Windows."""
+    return name if "\\" not in name or (folder / name).exists() else name.replace("\\", "/")
+
+
 def sha256(path: Path) -> str:
     """SHA-256 of a file's content in hexadecimal."""
     with path.open("rb") as file:

@@ -19,36 +19,60 @@ T = TypeVar("T")
 # Tags of the EXIF standard: its sub-directory, and how the picture is to be turned; a quarter by these.
 _EXIF, ORIENTATION = 0x8769, 0x0112
 QUARTER_TURNS = (5, 6, 7, 8)
+# Turns that undo another; every other one undoes itself.
+_INVERSE = {6: 8, 8: 6}
+# Number of pixels that show whether colours are multiplied by alpha.
+_EVIDENCE = 16
 
 
-def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded.
+def decode(path: Path) -> np.ndarray | None:
+    """Pixels of an image as stored, BGR or BGRA or grey, rows first; None where it cannot be decoded.
 
     Checksums come first, where the format has them: OpenCV makes room for whatever length a damaged part states.
     """
     if not _opened(path, _is_whole):
         return None
+    tiff = _opened(path, _tiff)
+    if tiff is not None:
+        return tiff
     try:
-        return cv2.imread(str(path), flags)
+        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except (cv2.error, MemoryError):
         return None
+
+
+def _tiff(image: Image) -> np.ndarray | None:
+    """Pixels of a TIFF as stored; None for other files.
+
+    OpenCV multiplies the colours of a TIFF by its alpha, and cannot read one that is to be turned.
+    """
+    if image.format != "TIFF":
+        return None
+    orientation = image.getexif().get(ORIENTATION) or 1
+    image.load()  # which turns it
+    kept = image.mode in ("L", "RGB", "RGBA") or image.mode.startswith(("I", "F"))
+    mode = {"1": "L", "LA": "RGBA", "PA": "RGBA", "RGBa": "RGBA"}.get(image.mode, "RGB")
+    stored = exif_turned(np.asarray(image if kept else image.convert(mode)), _INVERSE.get(orientation, orientation))
+    return stored if stored.ndim == 2 else np.ascontiguousarray(stored[..., [2, 1, 0, 3][: stored.shape[2]]])
+
+
+def is_premultiplied(rgba: np.ndarray) -> bool:
+    """Whether the colours of an (H, W, 4) uint8 picture are multiplied by its alpha, by its half transparent pixels.
+
+    Then no colour is above alpha. Evidence are pixels whose alpha is below what opaque pixels have for a colour: those
+    of a picture with straight alpha would be above it.
+    """
+    brightest, alpha = rgba[..., :3].max(-1), rgba[..., 3]
+    opaque = brightest[alpha > 250]
+    if not opaque.size or brightest[alpha == 0].any():
+        return False
+    evidence = (alpha > 0) & (alpha < 0.75 * np.quantile(opaque, 0.1))
+    return bool(evidence.sum() >= _EVIDENCE and (brightest[evidence] <= alpha[evidence] + 1.0).all())
 
 
 def palette_indices(path: Path) -> np.ndarray | None:
     """(H, W) numbers of the colours of a picture that has a palette without transparency; None for other pictures."""
     return _opened(path, lambda image: np.asarray(image) if _has_palette(image) else None)
-
-
-def decode_tiff(path: Path) -> np.ndarray | None:
-    """(H, W, 3) BGR or (H, W, 4) BGRA of a TIFF that is to be turned, as stored; OpenCV cannot read these."""
-
-    def read(image: Image) -> np.ndarray:
-        orientation = image.getexif().get(ORIENTATION) or 1  # Pillow turns a TIFF when it loads it
-        pixels = np.asarray(image.convert("RGBA" if "A" in image.mode else "RGB"))
-        stored = exif_turned(pixels, {6: 8, 8: 6}.get(orientation, orientation))
-        return np.ascontiguousarray(stored[..., [2, 1, 0, 3][: stored.shape[2]]])
-
-    return _opened(path, read)
 
 
 def exif_turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -89,7 +113,8 @@ def _opened(path: Path, read: Callable[[Image], T]) -> T | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as image:
+            # By a path Pillow maps uncompressed files into memory, and gets those wrong that are to be turned.
+            with path.open("rb") as file, Image.open(file) as image:
                 return read(image)
     except Exception:  # Pillow's readers raise many kinds of exceptions on damaged files
         return None

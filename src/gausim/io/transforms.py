@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
+from gausim.io.files import slashed
 from gausim.io.pixels import read_header
 from gausim.io.plain_json import read_json
 
@@ -27,7 +28,7 @@ REFUSED = {
     "lens": "Export a pinhole or OpenCV lens.",
     "rolling_shutter": "Use images of a global shutter, or set the field to 0.",
     "from_mitsuba": "Export camera to world in OpenGL axes.",
-    "mask_path": "Write the masks into the images' alpha with `gausim prepare segment`, and delete the field.",
+    "mask_path": "Write the masks into the images' alpha with `gausim prepare poses --transforms FILE`.",
 }
 # They describe how other programs normalise or start; the poses stand as they are.
 LEFT_ASIDE = (
@@ -164,23 +165,21 @@ def refuse_fields(fields: dict[str, Any], field: str, *, obeyed: Collection[str]
         raise DataError(f"{field}: field '{key}' is {value!r:.60}, which is not supported. {remedy}")
 
 
-def image_name(entry: dict[str, Any], field: str, folder: Path) -> str:
-    """File name of an entry's image in a folder, with the extension of the file that is there.
+def image_name(entry: dict[str, Any], field: str, folder: Path, key: str = "file_path") -> str:
+    """File name of an entry's image (or of what ``key`` names) in a folder, with the extension of the file there.
 
     Blender omits the extension, programs of Windows write backslashes, and images may have been converted since.
 
     Raises:
         DataError: the entry has no file name or an invalid one, or several images fit it.
     """
-    name = entry.get("file_path")
+    name = entry.get(key)
     if not isinstance(name, str) or not name:
-        raise DataError(f"{field}: field 'file_path' must name an image, got {name!r:.80}.")
+        raise DataError(f"{field}: field '{key}' must name an image, got {name!r:.80}.")
     # File systems have no longer names, and querying one raises an OSError.
     if any(len(part.encode()) > _LONGEST_NAME for part in name.split("/")) or not name.isprintable():
-        raise DataError(f"{field}: field 'file_path' is no name of a file: {name!r:.60}.")
-    if (folder / name).is_file():
-        return name
-    name = name.replace("\\", "/")
+        raise DataError(f"{field}: field '{key}' is no name of a file: {name!r:.60}.")
+    name = slashed(folder, name)
     if (folder / name).is_file():
         return name
     stem, suffix = name, ""
@@ -193,7 +192,7 @@ def image_name(entry: dict[str, Any], field: str, folder: Path) -> str:
                 if not any((folder / one).samefile(folder / other) for other in found[:i])]  # fmt: skip
     if len(distinct) > 1:
         raise DataError(
-            f"{field}: field 'file_path' '{name}' fits {' and '.join(distinct)}. Write the name with its extension."
+            f"{field}: field '{key}' '{name}' fits {' and '.join(distinct)}. Write the name with its extension."
         )
     return distinct[0] if distinct else stem + (suffix or ".png")
 

@@ -21,6 +21,7 @@ from gausim.core import GausSimError, RunError
 from gausim.io.files import read_yaml, remove_leftovers, write_durably
 from gausim.runs.checkpoint import PREVIOUS_CHECKPOINT, read_checkpoint
 from gausim.runs.comparison import changed_keys
+from gausim.runs.data_print import DATA
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
 
@@ -29,7 +30,7 @@ DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # Files that `overwrite` removes; gausim made no others in the directory.
 OWN_FILES = (
     CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS,
-    MOTION,
+    MOTION, DATA,
 )  # fmt: skip
 # Files that Hydra makes before a job starts.
 HYDRA_FILES = (".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml", "train.log")
