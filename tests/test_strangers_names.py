@@ -6,6 +6,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from gausim.cli.main import main
 from gausim.compose.command import quoted, with_data_directories
 from gausim.compose.config import compose
 from gausim.compose.targets import check_hydra, check_seed
@@ -34,6 +35,12 @@ def test_a_home_is_expanded_and_a_sweep_stays_one(tmp_path: Path, monkeypatch) -
     assert compose(quoted(["data=object", "data.root=~/é", "name=x"])).data.root == str(tmp_path / "é")
     kept = ["seed=0,1", "name='a b'", "data.sequences=[seq_000,seq_001]", "plan.epochs=3", "~logger", "data.test=null"]
     assert quoted(kept) == kept
+
+
+def test_a_path_that_is_an_interpolation_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "${x}").mkdir()
+    with pytest.raises(ConfigError, match="Rename the folder"):
+        with_data_directories([f"data={tmp_path}/${{x}}"])
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, True, 1.5])
@@ -74,6 +81,16 @@ def test_a_yaml_that_contains_itself_or_is_huge_is_refused_and_common_aliases_ar
     shared = [1, 2]
     (tmp_path / "c.yaml").write_text(yaml.safe_dump({"a": shared, "b": shared}))
     assert read_yaml(tmp_path / "c.yaml") == {"a": [1, 2], "b": [1, 2]}
+
+
+@pytest.mark.parametrize("place", ["config.yaml", "experiment/evil.yaml", "data/test/evil.yaml"])
+def test_aliases_of_a_run_of_others_are_bounded(tmp_path: Path, place: str, capsys) -> None:
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)]
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / place).write_text("\n".join(lines))
+    assert main(["train", "--config-dir", str(tmp_path), "--config-name", "config"]) == 2
+    assert "when its aliases are written out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)"])

@@ -135,12 +135,14 @@ def read_mask(path: Path, size: tuple[int, int], of: str) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"{path}: no such file, expected the mask of {of}. Restore it.")
     pixels, labels = read_picture(path), palette_indices(path)
-    alpha = pixels[..., 3] if pixels[..., 3].min() < 255 else pixels[..., :3].max(-1)
+    has_alpha = bool(pixels[..., 3].min() < 255)
+    alpha = pixels[..., 3] if has_alpha else pixels[..., :3].max(-1)
     if labels is not None and (pixels[..., :3] != pixels[..., :1]).any():
         alpha = np.where(labels > 0, 255, 0).astype(np.uint8)
     elif alpha.max() <= 1:  # a 1 of 16 bit is rounded away
         stored = _stored(path)
-        alpha = (255 * np.minimum(stored if stored.ndim == 2 else stored[..., :3].max(-1), 1)).astype(np.uint8)
+        values = stored if stored.ndim == 2 else stored[..., 3] if has_alpha else stored[..., :3].max(-1)
+        alpha = (255 * np.minimum(values, 1)).astype(np.uint8)
     if alpha.shape != (size[1], size[0]):
         raise DataError(
             f"{path}: is {alpha.shape[1]}x{alpha.shape[0]}, expected the mask of {of}, {size[0]}x{size[1]}. Export it "

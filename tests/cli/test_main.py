@@ -118,30 +118,3 @@ def test_an_interrupt_that_lightning_makes_an_exit_has_the_shells_status(command
     command(raising(SystemExit(3)))
     with pytest.raises(SystemExit):
         cli.main(["fake"])
-
-
-SUBJECTS = ("missing", "empty", "file", "binary")
-CALLS = {
-    "inspect": ["{}"], "reconstruct": ["{}", "--out", "out.ply"], "verify": ["{}"], "doctor": ["{}"],
-    "train": ["data={}"], "adapt": ["{}"], "evaluate": ["{}"], "simulate": ["{}"], "view": ["{}"],
-    "export": ["{}", "--format", "motion"], "report": ["{}"],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("subject", SUBJECTS)
-@pytest.mark.parametrize("name", CALLS)
-def test_what_is_no_run_scene_or_data_set_is_refused_in_a_sentence(
-    name: str, subject: str, tmp_path, monkeypatch, capsys
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("GAUSIM_DEBUG", raising=False)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").write_text("text\n")
-    (tmp_path / "binary").write_bytes(bytes(range(256)))
-    try:
-        status = cli.main([name, *(word.format(subject) for word in CALLS[name])])
-    except SystemExit as error:  # of argparse
-        status = error.code
-    shown = capsys.readouterr().err
-    assert status == 2 and subject in shown and "Traceback" not in shown
-    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "outputs") == ["binary", "empty", "file"]

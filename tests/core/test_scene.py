@@ -72,6 +72,17 @@ def test_scales_without_the_logarithm_are_named(scale: float) -> None:
         without_outliers(scene)
 
 
+@pytest.mark.parametrize(
+    ("opacity", "told"), [((0, 1), True), ((-3, 4), False), ((0.4, 0.6), False), ((0, 1.2), False)]
+)
+def test_opacities_without_the_logit_are_named(opacity: tuple[float, float], told: bool, tmp_path, caplog) -> None:
+    scene = replace(body(), opacity_logits=torch.linspace(*opacity, 60))
+    save_scene(scene, tmp_path / "a.ply")
+    with caplog.at_level(logging.WARNING):
+        load_scene(tmp_path / "a.ply")
+    assert ("without the logit" in caplog.text) is told and "--clean" not in caplog.text
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_a_sound_scene_has_none_in_any_unit(unit: float) -> None:
     scene = body()

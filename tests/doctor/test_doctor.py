@@ -14,6 +14,7 @@ from helpers.plain import cameras_at, edit_json, plain_scene
 
 from gausim.cli.main import main
 from gausim.core import Cameras, GaussianScene, Trajectory
+from gausim.io.ply import load_scene, save_scene
 
 SIZE, FRAMES, OMEGA = 64, 32, 0.7
 VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
@@ -129,6 +130,24 @@ def haze(root: Path) -> None:
     mistakes.every_image(root, lambda p: np.concatenate((p[..., :3], np.maximum(p[..., 3:], 5)), -1), "*/cam_0/*")
 
 
+def labels_for_alpha(root: Path) -> None:
+    mistakes.every_alpha(root, lambda alpha: alpha > 127)
+
+
+def palette_for_alpha(root: Path) -> None:
+    mistakes.every_alpha(root, lambda alpha: 76 * (alpha > 127))
+
+
+def premultiplied(root: Path) -> None:
+    mistakes.every_image(root, lambda p: np.dstack((p[..., :3] * (p[..., 3:] / 255) + 0.5, p[..., 3])).astype(np.uint8))
+
+
+def floater(root: Path) -> None:
+    scene = load_scene(root / "scene.ply")
+    scene.means[30] = 1e4
+    save_scene(scene, root / "scene.ply")
+
+
 def mask_drops_out(root: Path) -> None:
     def half(pixels: np.ndarray) -> np.ndarray:
         pixels[len(pixels) // 2 :, :, 3] = 0
@@ -185,6 +204,10 @@ def short(root: Path) -> None:
 MORE = {
     empty_masks: ("masks", "fault", "cam_2 never shows the object"),
     haze: ("masks", "warning", "haze of faint alpha (1 to 26 of 255) lies around the object in cam_0"),
+    labels_for_alpha: ("masks", "fault", "cam_3 never exceed 1 of 255"),
+    palette_for_alpha: ("masks", "fault", "cam_3 never exceed 76 of 255"),
+    premultiplied: ("masks", "warning", "multiplied by alpha already"),
+    floater: ("kernels", "warning", "1 of 48 kernels are outside of the body"),
     mask_drops_out: ("masks", "warning", "The mask of cam_3 jumps in size by more than 15% for a frame or two: "
                      "seq_000 frame 10"),
     cut_off: ("views", "warning", "The object is cut off at the left of cam_1"),
@@ -196,7 +219,7 @@ MORE = {
 }  # fmt: skip
 
 # The others take a second each.
-QUICK = ("OpenCV poses", "inverted masks", "one camera 2 frames late", "16-bit PNG", short)
+QUICK = ("OpenCV poses", "inverted masks", "one camera 2 frames late", "16-bit PNG", short, labels_for_alpha)
 
 
 def quick_or_slow(mistakes: object) -> list:

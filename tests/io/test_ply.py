@@ -1,5 +1,6 @@
 """3DGS PLY files: what is written is read back bit by bit, and every malformed file is refused by name."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from helpers.random_scene import FIELDS, random_scene
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
-from gausim.io.ply import load_masks, load_scene, save_masks, save_scene
+from gausim.io.ply import OTHER_FORMATS, load_masks, load_scene, save_masks, save_scene
 
 
 def columns_of(scene: GaussianScene) -> dict[str, np.ndarray]:
@@ -234,7 +235,7 @@ def test_a_compressed_ply_without_its_chunks_is_refused(tmp_path: Path) -> None:
         load_scene(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".spz", ".ksplat", ".sog"])
+@pytest.mark.parametrize("suffix", OTHER_FORMATS)
 def test_other_formats_of_splats_are_refused_with_the_way_to_convert(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"a{suffix}").write_bytes(bytes(64))
     with pytest.raises(SceneError, match=rf"is no PLY file.*splat-transform a{suffix} a\.ply"):
@@ -260,3 +261,34 @@ def test_positions_that_float32_cannot_hold_are_refused(tmp_path: Path, shift: f
         return
     with pytest.raises(SceneError, match="float32 has steps of .* Subtract"):
         load_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(("unit", "refused"), [(1e-6, True), (1e-4, True), (1e-2, False), (1e4, False), (1e8, True)])
+def test_extents_beyond_float32_are_refused_with_the_factor(tmp_path: Path, unit: float, refused: bool) -> None:
+    def write(factor: float) -> None:
+        columns = {n: values.astype(np.float64) for n, values in columns_of(random_scene()).items()}
+        columns |= {n: columns[n] * factor for n in "xyz"}
+        columns |= {f"scale_{i}": columns[f"scale_{i}"] + np.log(factor) for i in range(3)}
+        write_ply(tmp_path / "a.ply", columns)
+
+    write(unit)
+    if refused:
+        with pytest.raises(SceneError, match="the scene spans .* export again") as caught:
+            load_scene(tmp_path / "a.ply")
+        found = re.search(r"camera positions by (\S+), add (\S+) to", str(caught.value))
+        assert found is not None and np.log(float(found[1])) == pytest.approx(float(found[2]), abs=1e-4)
+        write(unit * float(found[1]))
+    assert load_scene(tmp_path / "a.ply").count
+
+
+def test_the_reference_lists_every_kind_of_file() -> None:
+    page = (Path(__file__).parents[2] / "docs/reference/data-set.md").read_text()
+    table = page[page.index("## scene.ply and its masks") : page.index("## Packed stores")]
+    rows = dict(line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| "))
+    (others,) = (what for file, what in rows.items() if all(f"`{suffix}`" in file for suffix in OTHER_FORMATS))
+    assert "refused" in others
+    known = {"compressed PLY": "read", "2DGS": "refused", "point cloud": "refused", "doubles": "float32",
+             "NaN": "refused", "far outside": "warning", "either byte order": "read", "normals": "read"}  # fmt: skip
+    for kind, what in known.items():  # each has its test above, or in tests/core/test_outliers.py
+        (found,) = (text for file, text in rows.items() if kind in file)
+        assert what in found, kind

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import torch
 from helpers.blob import ring_of_cameras
 
 from gausim.core import DataError
-from gausim.io.transforms import DISTORTION, LEFT_ASIDE, REFUSED, read_transforms, write_transforms
+from gausim.io.transforms import LEFT_ASIDE, REFUSED, read_transforms, write_transforms
 
 CAMERAS = ring_of_cameras(("a/0.png", "a/1.png"), width=20, height=16)
 CAMERAS.viewmats[:, :3, 3] += torch.tensor([[0.1, 0.2, -1.0], [-0.4, 0.3, -1.5]])
@@ -139,6 +140,7 @@ def test_a_name_that_two_images_fit_is_refused(tmp_path: Path) -> None:
         ({"camera_angle_x": 2 * math.atan(10 / 60), "fl_y": 50.0}, {}, (60.0, 50.0)),
         ({"fl_x": 9.0, "fl_y": 9.0}, {"camera_angle_x": 2 * math.atan(10 / 70)}, (70.0, 70.0)),
         ({"camera_angle_x": 1.0}, {"fl_x": 30.0, "fl_y": 40.0}, (30.0, 40.0)),
+        ({"fl_x": 30.0, "fl_y": 31.0}, {"camera_angle_y": 2 * math.atan(8 / 90)}, (30.0, 90.0)),
     ],
 )
 def test_focal_lengths_of_all_dialects(tmp_path: Path, file, entry, focal: tuple[float, float]) -> None:
@@ -179,10 +181,58 @@ def test_fields_of_no_effect_change_nothing(tmp_path: Path, field: str) -> None:
     torch.testing.assert_close(posed.cameras.Ks, CAMERAS.Ks)
 
 
-def test_the_reference_lists_every_field() -> None:
+# Fields by the programs that write them, as their exporters do today.
+DIALECTS = {
+    "instant-ngp": "camera_angle_x camera_angle_y fl_x fl_y k1 k2 k3 k4 p1 p2 is_fisheye cx cy w h aabb_scale scale "
+    "offset up file_path sharpness transform_matrix lens rolling_shutter from_mitsuba n_extra_learnable_dims",
+    "nerfstudio": "w h fl_x fl_y cx cy k1 k2 k3 k4 p1 p2 camera_model file_path transform_matrix colmap_im_id "
+    "mask_path depth_file_path applied_transform applied_scale ply_file_path orientation_override",
+    "Blender": "camera_angle_x file_path rotation transform_matrix",
+    "Metashape": "camera_model w h fl_x fl_y cx cy k1 k2 k3 k4 p1 p2 aabb_scale scale offset up file_path sharpness "
+    "transform_matrix",
+    "D-NeRF": "camera_angle_x file_path rotation time transform_matrix",
+}
+# A value of each field that the reader obeys.
+VALUES = {
+    "w": 22, "h": 18, "fl_x": 31.0, "fl_y": 32.0, "cx": 3.0, "cy": 4.0, "camera_angle_x": 0.7, "camera_angle_y": 0.8,
+    "file_path": "a/7.png", "transform_matrix": np.eye(4).tolist(), "time": 0.5, "k1": 0.1, "k2": 0.1, "k3": 0.1,
+    "k4": 0.1, "p1": 0.1, "p2": 0.1, "camera_model": "OPENCV_FISHEYE",
+}  # fmt: skip
+
+
+def outcome(tmp_path: Path, field: str) -> str:
+    """What the reader makes of a field of all entries."""
+    if field in LEFT_ASIDE:
+        return "left aside"
+    own = {"fl_x": None, "fl_y": None, "camera_angle_x": 0.9} if field.startswith("camera_angle") else {}
+    before = read_transforms(written(tmp_path, **own))
+    path = written(tmp_path, **own)
+    data = json.loads(path.read_text())
+    for entry in data["frames"]:
+        entry[field] = VALUES.get(field, "set")
+    path.write_text(json.dumps(data))
+    try:
+        after = read_transforms(path)
+    except DataError as error:
+        return "refused" if field in str(error) else str(error)
+    same = torch.equal(before.cameras.Ks, after.cameras.Ks) and torch.equal(
+        before.cameras.viewmats, after.cameras.viewmats
+    )
+    alike = same and before.frames == after.frames and before.cameras.width == after.cameras.width
+    return "nothing" if alike and before.cameras.height == after.cameras.height else "obeyed"
+
+
+def test_the_reference_says_what_becomes_of_every_field(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/reference/data-set.md").read_text()
-    rows = [line for line in page.splitlines() if line.startswith("| `")]
-    for field in (*REFUSED, *(f for f in DISTORTION if f[0] == "p")):
-        assert any(f"`{field}`" in row and "refused" in row for row in rows), field
-    for field in LEFT_ASIDE:
-        assert any(f"`{field}`" in row and "left aside" in row for row in rows), field
+    page = page[page.index("What becomes of the fields") : page.index("## Masks")]
+    rows = [line.split("|")[1:4] for line in page.splitlines() if line.startswith("| `") and line.count("|") == 4]
+    listed = {field: (writers, what) for names, writers, what in rows for field in re.findall(r"`(\w+)`", names)}
+    for dialect, fields in DIALECTS.items():
+        for field in fields.split():
+            writers, what = listed[field]
+            assert dialect in writers or "all" in writers, (dialect, field)
+            assert outcome(tmp_path, field) in what, (dialect, field, what)
+    for field, (writers, _) in listed.items():
+        for dialect in DIALECTS:
+            assert dialect not in writers or field in DIALECTS[dialect].split(), (dialect, field)
+    assert {*REFUSED, *LEFT_ASIDE} <= set(listed)

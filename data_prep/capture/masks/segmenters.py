@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from data_prep.capture.masks.clips import Clip, sampled
-from data_prep.common.photos import read_picture
+from data_prep.common.photos import read_mask, read_picture
 from gausim.core import DataError
 
 MaskOf = Callable[[int], np.ndarray]
@@ -43,12 +43,11 @@ def alpha_masks(clip: Clip) -> MaskOf:
     """The alpha channel that the pictures have already; a picture without any transparency is refused."""
 
     def mask(index: int) -> np.ndarray:
-        alpha = read_picture(clip.file(index))[..., 3]
+        path = clip.file(index)
+        alpha = read_picture(path)[..., 3]
         if alpha.min() == 255:
-            raise DataError(
-                f"{clip.file(index)}: has no transparent pixel, so its alpha is no mask. Choose another --backend."
-            )
-        return alpha.astype(np.float32) / 255
+            raise DataError(f"{path}: has no transparent pixel, so its alpha is no mask. Choose another --backend.")
+        return read_mask(path, (alpha.shape[1], alpha.shape[0]), path.name).astype(np.float32) / 255
 
     return mask
 

@@ -25,6 +25,7 @@ from gausim.compose.errors import one_sentence, suggestion
 from gausim.compose.root import HYDRA_VERSION_BASE, ROOT_FILE, conf_dir, options
 from gausim.compose.targets import check_hydra
 from gausim.core.errors import ConfigError, GausSimError
+from gausim.io.files import bounded_yaml
 
 # Values with quotes, lists, mappings and interpolations were meant as Hydra's grammar: its own message helps there.
 _QUOTES = re.compile(r"^[\[{'\"]|[$]\{|['\"]$")
@@ -56,6 +57,8 @@ def run_hydra(task: Callable[[DictConfig], object], argv: Sequence[str]) -> int:
     """
     given = get_args_parser().parse_args(list(argv))
     sweep, folders = given.multirun, [Path(given.config_dir).resolve()] if given.config_dir else []
+    for folder in folders:
+        _check_files(folder)
     with one_sentence(given.overrides):
         words = quoted(with_data_directories(given.overrides, sweep=sweep, folders=folders))
         words += [f"hydra.searchpath=['file://{folder}']" for folder in folders]
@@ -81,6 +84,15 @@ def run_hydra(task: Callable[[DictConfig], object], argv: Sequence[str]) -> int:
         finally:
             GlobalHydra.instance().clear()
     return 0
+
+
+def _check_files(folder: Path) -> None:
+    """Refuses a folder of configurations with a file that would take all memory when its aliases are written out."""
+    for path in (path for depth in ("", "*/", "*/*/") for path in folder.glob(f"{depth}*.yaml")):
+        try:
+            bounded_yaml(path)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
 
 
 def _run(hydra: Hydra, name: str, job: Job, words: list[str], *, sweep: bool) -> None:
@@ -136,6 +148,8 @@ def with_data_directories(words: Sequence[str], *, sweep: bool = False, folders:
             raise ConfigError(
                 f"data={absent[0]}: neither a directory nor a name of conf/data.{suggestion(absent[0], known)}"
             )
+        if any("${" in str(path.resolve()) for path in paths):
+            raise ConfigError(f"{word}: '${{' in a path begins an interpolation of Hydra. Rename the folder.")
         if paths and len(paths) < len(values):
             raise ConfigError(f"{word}: expected names of conf/data or directories, not both.")
         roots = ",".join("'" + str(path.resolve()).replace("'", "\\'") + "'" for path in paths)

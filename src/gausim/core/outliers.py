@@ -15,6 +15,8 @@ from gausim.core.scene import GaussianScene
 FAR, LARGE = 5.0, 1.0
 # Typical standard deviation, in extents, from which positive log scales are taken for plain ones.
 PLAIN = 0.25
+# Spread of opacities between 0 and 1 that logits do not have by chance.
+_SPREAD = 0.5
 _FEWEST = 4  # kernels, fewer have no extent
 
 
@@ -53,7 +55,11 @@ def outliers(scene: GaussianScene) -> list[Outliers]:
         (large, f"larger than the body (standard deviation up to {float(sizes.max()) / extent:.3g} of its extent)"),
         (far, f"outside of the body by more than {FAR:g} times its extent"),
     ]
-    return [
+    opacity = scene.opacity_logits[scene.simulated]
+    unit = Outliers(torch.zeros_like(scene.simulated), f"all {len(body)} opacities lie between 0 and 1: they seem "
+                    "to be stored without the logit. Export them as 3DGS does.")  # fmt: skip
+    plain = bool(((opacity >= 0) & (opacity <= 1)).all()) and float(opacity.max() - opacity.min()) > _SPREAD
+    return [unit] * plain + [
         Outliers(mask, f"{int(mask.sum())} of {scene.count} kernels are {text} (first: number "
                  f"{int(mask.nonzero()[0])}). They spoil the diagonal and the masses.")
         for mask, text in found if mask.any()

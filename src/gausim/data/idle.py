@@ -21,18 +21,23 @@ def idle_sequences(objects: Sequence[ObjectData]) -> Iterator[str]:
             if what:
                 found.setdefault(what, []).append(record.name)
         for what, names in found.items():
-            yield f"{item.root}: {', '.join(names)} {what}. Leave these sequences out, or export them again."
+            yield f"{item.root}: {what} in {', '.join(names)}. Leave these sequences out, or export them again."
 
 
 def _idle(item: ObjectData, name: str) -> str:
     # A record of its own, which does not keep the decoded images.
     record, stop = item.record(name), item.train_frames.stop
     chosen = np.unique(np.linspace(0, stop - 1, _FRAMES).round().astype(int)).tolist()
-    frames = [record.frames(range(f, f + 1), item.train_views)[0].numpy().astype(np.float32) for f in chosen]
-    if not any(frame[..., 3].any() for frame in frames):
-        return "show nothing (alpha is 0 in all training views)"
-    shown = [frame[..., :3] * (frame[..., 3:] / 255) for frame in frames]
-    if max(float(picture.max()) for picture in shown) <= _SAME:
-        return "are black where alpha shows the object"
-    apart = max(float(np.abs(picture - shown[0]).max()) for picture in shown)
-    return "do not move: the frames of every training view are one picture" if apart <= _SAME else ""
+    alpha, brightest, apart = 0, 0.0, 0.0
+    for view in item.train_views:
+        pictures = np.concatenate([record.frames(range(f, f + 1), [view]).numpy()[:, 0] for f in chosen])
+        shown = pictures[..., :3] * (pictures[..., 3:] / np.float32(255))
+        alpha, brightest = max(alpha, int(pictures[..., 3].max())), max(brightest, float(shown.max()))
+        apart = max(apart, float(np.abs(shown - shown[0]).max()))
+        if apart > _SAME:
+            return ""
+    if alpha == 0:
+        return "nothing is visible (alpha is 0 in all training views)"
+    if brightest <= _SAME:
+        return "the object is black"
+    return "nothing moves (the frames of every training view are one picture)"

@@ -83,8 +83,8 @@ def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
 
 
 def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
-    """Reads every image and checks that the object is visible."""
-    seen = dict.fromkeys(record.views, False)
+    """Reads every image and checks that its mask shows the object."""
+    most = dict.fromkeys(record.views, 0)
     for start in range(0, record.count, FRAMES_AT_A_TIME):
         for view in record.views:
             try:
@@ -92,10 +92,16 @@ def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
             except GausSimError as error:
                 yield Fault(where, str(error))
                 return
-            seen[view] |= bool((found[..., 3] > 0).any())
-    for view, visible in seen.items():
-        if not visible:
+            most[view] = max(most[view], int(found[..., 3].max()))
+    for view, value in most.items():
+        if value == 0:
             yield Fault(where, f"view '{view}' never shows the object (alpha is 0). Take it out, or mask it again.")
+        elif value < 128:
+            yield Fault(
+                where,
+                f"the masks of view '{view}' never exceed {value} of 255: labels or colours were taken for alpha. "
+                "Write them again as 0 and 255.",
+            )
 
 
 def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:

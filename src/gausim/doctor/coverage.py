@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gausim.core import SceneError
+from gausim.core.outliers import outliers
 from gausim.doctor.evidence import Evidence, Finding, listed
 from gausim.ops.selection import require_pinned
 from gausim.ops.visual_hull import search_cube
@@ -105,6 +106,16 @@ def find_tiny(evidence: Evidence) -> Iterator[Finding]:
                 "picture's longer side.",
                 "Film from nearer or with a longer lens, or crop the pictures (and shift cx, cy, w and h with them).",
             )  # fmt: skip
+
+
+def find_outliers(evidence: Evidence) -> Iterator[Finding]:
+    """Finds kernels of the rest scene that are most likely wrong."""
+    for found in [] if evidence.scene is None else outliers(evidence.scene):
+        yield Finding(
+            "warning", f"Rest scene: {found.what}",
+            f"`gausim inspect {evidence.data.scene_path} --clean OUT.ply` writes the scene without kernels that are "
+            "too large or too far away.",
+        )  # fmt: skip
 
 
 def find_pins(evidence: Evidence) -> Iterator[Finding]:

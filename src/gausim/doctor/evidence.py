@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -15,6 +15,7 @@ from gausim.core import Cameras, GaussianScene
 from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
 from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_silhouette
+from gausim.io.pixels import is_premultiplied
 from gausim.runs.bar import with_bar
 
 Severity = Literal["fault", "warning", "note"]
@@ -54,6 +55,7 @@ class Watched:
     cameras: Cameras  # of the reduced images
     rgb: UInt8[np.ndarray, "F V h w 3"]  # over black
     alpha: UInt8[np.ndarray, "F V h w"]  # foreground
+    premultiplied: tuple[bool, ...] = ()  # whether the colours of frame 0 are multiplied by alpha, of each view
 
     @cached_property
     def gray(self) -> Float[np.ndarray, "F V h w"]:
@@ -124,7 +126,7 @@ def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
         scale = min(1.0, LONGEST / max(record.cameras.width, record.cameras.height))
         item = _reduced(record, frames, scale)
         watched += [item] if name in watched_names else []
-        first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))
+        first.append(replace(item, rgb=item.rgb[:1], alpha=item.alpha[:1]))
     return Evidence(data, len(names), scene, scale, tuple(watched), tuple(first))
 
 
@@ -139,12 +141,14 @@ def _reduced(record: SequenceRecord, frames: int, factor: float) -> Watched:
     width, height = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
     shape = (frames, len(record.views), height, width)
     rgb, alpha = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
+    doubled: tuple[bool, ...] = ()
     for start in range(0, frames, FRAMES_AT_A_TIME):
         block = record.frames(range(start, min(start + FRAMES_AT_A_TIME, frames))).numpy()
+        doubled = doubled or tuple(is_premultiplied(picture) for picture in block[0])
         for (f, v), pixels in ((i, block[i]) for i in np.ndindex(block.shape[:2])):
             over_black = (pixels[..., :3] * (pixels[..., 3:] / np.float32(255)) + 0.5).astype(np.uint8)
             rgb[start + f, v] = cv2.resize(over_black, (width, height), interpolation=cv2.INTER_AREA)
             alpha[start + f, v] = cv2.resize(pixels[..., 3], (width, height), interpolation=cv2.INTER_AREA)
     stretch = torch.tensor([[width / cameras.width], [height / cameras.height], [1.0]])
     small = Cameras(cameras.viewmats, cameras.Ks * stretch, width, height, cameras.names)
-    return Watched(record.name, small, rgb, alpha)
+    return Watched(record.name, small, rgb, alpha, doubled)

@@ -13,6 +13,7 @@ from gausim.runs.bar import with_bar
 # Each check with the others whose faults invalidate it, and its finders, one per kind of fault.
 CHECKS = (
     ("pins", (), (coverage.find_pins,)),
+    ("kernels", (), (coverage.find_outliers,)),
     ("extent", (), (coverage.find_few_frames,)),
     ("masks", (), (masks.find_mask_faults,)),
     ("calibration", ("masks",), (calibration.find_calibration_faults,)),

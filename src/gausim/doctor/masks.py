@@ -30,6 +30,7 @@ def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
         yield _inverted_or_absent(evidence, full)
         return
     yield from _empty(evidence)
+    yield from _encoded(evidence)
     yield from _haze(evidence)
     yield from _blinking(evidence)
 
@@ -76,6 +77,26 @@ def _empty(evidence: Evidence) -> Iterator[Finding]:
             "fault" if empty > _MANY else "warning",
             f"{view} {told}: the mask is empty (first: {first}).",
             f"Segment {view} again; where it does not see the object, take it out of dataset.json (field 'views').",
+        )  # fmt: skip
+
+
+def _encoded(evidence: Evidence) -> Iterator[Finding]:
+    most = {view: max(int(item.alpha[:, v].max()) for item in evidence.watched)
+            for v, view in enumerate(evidence.views)}  # fmt: skip
+    faint = [view for view, value in most.items() if 0 < value <= 127]
+    if faint:
+        yield Finding(
+            "fault",
+            f"The masks of {listed(faint)} never exceed {max(most[view] for view in faint)} of 255: labels or colours "
+            "of a palette were taken for alpha, so the object is transparent.",
+            "Write the masks again as 0 and 255, e.g. with `gausim prepare segment PICTURES --backend masks`.",
+        )  # fmt: skip
+    doubled = [view for v, view in enumerate(evidence.views) if all(item.premultiplied[v] for item in evidence.first)]
+    if doubled:
+        yield Finding(
+            "warning",
+            f"The colours of {listed(doubled)} are multiplied by alpha already (premultiplied), so edges become dark.",
+            "Divide them by alpha: `gausim prepare segment PICTURES --backend alpha` does.",
         )  # fmt: skip
 
 

@@ -69,18 +69,24 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """A mapping from a YAML file, with the safe loader: no tag builds an object.
 
     Raises:
-        ValueError: the file is missing, not YAML or not a mapping.
+        ValueError: the file is missing, not YAML, has too many values or is not a mapping.
     """
+    loaded = bounded_yaml(path)
+    if not isinstance(loaded, dict):
+        raise ValueError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+    return loaded
+
+
+def bounded_yaml(path: Path) -> Any:
+    """What a YAML file contains, as :func:`read_yaml` reads it."""
     try:
         if path.stat().st_size > _MOST_YAML:
             raise yaml.YAMLError(f"has {path.stat().st_size} bytes, more than {_MOST_YAML}")
         loaded = yaml.safe_load(path.read_text())
         _expanded(loaded, {})
+        return loaded
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML ({error}).") from error
-    if not isinstance(loaded, dict):
-        raise ValueError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
-    return loaded
+        raise ValueError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
 
 
 def _expanded(value: Any, known: dict[int, int]) -> int:

@@ -35,6 +35,8 @@ MASK_NAMES = ("simulated", "pinned", "foreground")
 OTHER_FORMATS = (".splat", ".ksplat", ".spz", ".sog", ".rad")
 # Steps of float32 up to this fraction of the body's extent lose nothing that is visible.
 COARSEST_STEP = 1e-4
+# Extents between which products of a kernel's three variances stay within float32 [scene units].
+LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e6
 # f_rest has (d + 1)^2 - 1 coefficients for each of three channels.
 _REST_COUNTS = (0, 9, 24, 45)
 _POSITION, _COLOR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -80,7 +82,7 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     path = Path(path)
     table = _read_vertices(path)
     rest = _rest_names(path, table.dtype.names or ())
-    _check_precision(path, table)
+    _check_extent(path, table)
     values = torch.from_numpy(_columns(path, table, [*_POSITION, *_SHAPE, *_COLOR, *rest]))
     means, opacity, log_scales, quats, color, high = values.split((3, 1, 3, 4, 3, len(rest)), dim=1)
     sh = torch.cat([color[:, None], high.reshape(len(values), 3, -1).transpose(1, 2)], dim=1)
@@ -98,9 +100,9 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     side = masks_path(path) if masks is None else Path(masks)
     scene = load_masks(scene, side) if masks is not None or side.is_file() else scene
     for found in outliers(scene):
-        logger.warning(
-            "%s: %s `gausim inspect %s --clean OUT.ply` writes the scene without them.", path, found.what, path
-        )
+        some = 0 < int(found.mask.sum()) < scene.count
+        remedy = f" `gausim inspect {path} --clean OUT.ply` writes the scene without them." if some else ""
+        logger.warning("%s: %s%s", path, found.what, remedy)
     return scene
 
 
@@ -189,8 +191,8 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     return rest
 
 
-def _check_precision(path: Path, table: np.ndarray) -> None:
-    """Raises a :class:`SceneError` where float32 cannot hold the positions, as in coordinates of a country."""
+def _check_extent(path: Path, table: np.ndarray) -> None:
+    """Raises a :class:`SceneError` where float32 cannot hold the positions or variances, as in UTM or micrometres."""
     x = structured_to_unstructured(table[list(_POSITION)], np.float64)
     if not (np.abs(x) < np.finfo(np.float32).max).all():
         return  # refused by name later
@@ -204,6 +206,13 @@ def _check_precision(path: Path, table: np.ndarray) -> None:
             f"{path}: positions lie around ({center}), {far / extent:.3g} times the scene's extent from the origin: "
             f"float32 has steps of {step:.2g} there. Subtract ({center}) from x, y, z and from the camera positions, "
             "and export again."
+        )
+    if extent > 0 and not LEAST_EXTENT <= extent <= MOST_EXTENT:
+        factor = 10.0 ** -round(np.log10(extent))
+        raise SceneError(
+            f"{path}: the scene spans {extent:.2g} units; float32 computes well between {LEAST_EXTENT:g} and "
+            f"{MOST_EXTENT:g}. Multiply positions and camera positions by {factor:g}, add {np.log(factor):.4f} to "
+            "scale_0, scale_1 and scale_2, and export again."
         )
 
 

@@ -151,8 +151,9 @@ def positive_field(fields: dict[str, Any], key: str, where: str) -> float:
 
 def lens_fields(data: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
     """The fields of the file and of an entry, which wins: its focal length replaces the file's in either form."""
-    own = {key for axis in "xy" for key in (f"fl_{axis}", f"camera_angle_{axis}") if key in entry}
-    replaced = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y") if own else ()
+    own = [axis for axis in "xy" if f"fl_{axis}" in entry or f"camera_angle_{axis}" in entry]
+    # One across alone counts downwards, too.
+    replaced = [f"{form}_{axis}" for form in ("fl", "camera_angle") for axis in ("xy" if "x" in own else own)]
     return {**{key: value for key, value in data.items() if key not in replaced}, **entry}
 
 
