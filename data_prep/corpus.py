@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 from safetensors.numpy import load_file, save
 
+from data_prep.blender.meshes import read_mesh
 from data_prep.common.command import add_options, chosen, cores, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, each, silent
 from data_prep.common.stage import Stage, run_stage
@@ -37,6 +38,8 @@ def make_corpus(out: Path, plan: Plan, *, workers: int, overwrite: bool = False,
     if len(set(settings["meshes"])) < len(plan.meshes):
         raise ConfigError(f"--meshes: two files have one name: {', '.join(settings['meshes'])}.")
     meshes = {f"mesh_{path.name}": path for path in plan.meshes}
+    for path in plan.meshes:
+        read_mesh(path)  # raises before a body is made
     stage = Stage("corpus", REVISION, meshes, settings, PACKAGES)
     return run_stage(stage, out, lambda work: _make(work, plan, settings, workers, tick), overwrite=overwrite)
 

@@ -74,7 +74,12 @@ def run_stage(
     manifest = read_manifest(work) if (work / MANIFEST).is_file() else {}
     if _different(manifest, key):
         _open_work(work, key)
-        results = json.loads(json.dumps(make(work), allow_nan=False))
+        try:
+            results = json.loads(json.dumps(make(work), allow_nan=False))
+        except Exception:
+            if not any(path.is_file() and path.name != PLAN for path in work.rglob("*")):
+                shutil.rmtree(work, ignore_errors=True)  # there is nothing to go on with
+            raise
         manifest = {**key, "versions": _versions(stage.packages), "results": results}
         write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
     (work / PLAN).unlink(missing_ok=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import resource
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,10 +21,12 @@ CALLS = {
     "train": ["data={}"], "adapt": ["{}"], "evaluate": ["{}"], "simulate": ["{}"], "view": ["{}"],
     "export": ["{}", "--format", "motion"], "report": ["{}"],
     "prepare ingest": ["{}", "--out", "out"], "prepare poses": ["--images", "{}", "--out", "out"],
-    "prepare segment": ["{}", "--backend", "alpha", "--out", "out"], "prepare select": ["{}", "--out", "out"],
+    "prepare segment": ["{}", "--backend", "alpha", "--out", "out"],
+    "prepare select": ["{}", "--pinned", "below z=0.1", "--out", "out"],
     "prepare assemble": ["{}", "--out", "out"], "prepare pack": ["{}", "--out", "out"],
     "prepare public": ["physdreamer", "{}", "--out", "out", "--cameras", "p0"],
-    "prepare corpus": ["--meshes", "{}", "--out", "out"], "prepare blender_bunny": ["--mesh", "{}", "--out", "out"],
+    "prepare corpus": ["--meshes", "{}", "--out", "out"], "prepare blender_bunny": ["--mesh", "{}", "--out", "out",
+                                                                              "--blender-python", sys.executable],
     "prepare poses --colmap": ["--colmap", "{}", "--images", "empty", "--out", "out"],
     "prepare poses --transforms": ["--transforms", "{}", "--out", "out"],
 }  # fmt: skip

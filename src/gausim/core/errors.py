@@ -7,6 +7,7 @@ import re
 _TEMPORARY = re.compile(r"(?<![^/\\])\.([^/\\]+)\.[0-9]+\.tmp(?:\.\w+)?$")
 _REMEDIES = {
     errno.ENOSPC: "Make room on the disk.",
+    errno.EFBIG: "Choose a disk that takes larger files, or raise the limit (`ulimit -f`).",
     errno.EDQUOT: "Make room: the quota is used up.",
     errno.EACCES: "Correct the permissions, or choose another path.",
     errno.EPERM: "Correct the permissions, or choose another path.",

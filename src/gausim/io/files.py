@@ -39,6 +39,10 @@ def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) 
             os.replace(path, previous)  # for a moment only ``previous`` exists
         os.replace(temporary, path)
         _sync_directory(path.parent)
+    except OSError as error:
+        if error.filename is None:  # a full disk does not say of which file
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
