@@ -72,7 +72,7 @@ def full_disk() -> Iterator[None]:
 def status_of(name: str, words: list[str]) -> int:
     parts = name.split()
     try:
-        return cli.main([*(part for part in parts if not part.startswith("--") or part == "--clean"), *words])
+        return cli.main([*(part for part in parts if not part.startswith("--")), *words])
     except SystemExit as error:  # of argparse
         return int(error.code or 0)
 

@@ -98,10 +98,16 @@ def _check_files(folder: Path) -> None:
 def _run(hydra: Hydra, name: str, job: Job, words: list[str], *, sweep: bool) -> None:
     if name != ROOT_FILE:  # the configuration that a run has saved
         check_hydra(hydra.compose_config(name, words, run_mode=RunMode.RUN, with_log_configuration=False).hydra)
-    if sweep:
-        hydra.multirun(name, job, [*words, "hydra.mode=MULTIRUN"])
-    else:
-        hydra.run(name, job, [*words, "hydra.mode=RUN"])
+    try:
+        if sweep:
+            hydra.multirun(name, job, [*words, "hydra.mode=MULTIRUN"])
+        else:
+            hydra.run(name, job, [*words, "hydra.mode=RUN"])
+    except OSError as error:
+        if error.filename is None:  # a full disk does not say of which file
+            given = (word.partition("=")[2] for word in words if word.startswith("output_root="))
+            error.filename = next(given, "outputs")
+        raise
     if job.error is not None:
         raise job.error
 

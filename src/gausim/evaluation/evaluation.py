@@ -27,6 +27,7 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.evaluation.film import Film
 from gausim.evaluation.references import Bounces, Reference
+from gausim.io.files import write_durably
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.report.render import evaluation_page
@@ -179,7 +180,7 @@ def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, A
     save_curves(folder / "metrics.npz", objects)
     results = results_of(objects, run)
     save_results(folder / "metrics.json", results)
-    (folder / "table.md").write_text(evaluation_page(results))
+    write_durably(folder / "table.md", evaluation_page(results).encode())
     return results
 
 

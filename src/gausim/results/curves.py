@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gausim.core import RunError
+from gausim.io.files import replacing
 from gausim.io.npz import read_npz
 from gausim.results.table import ObjectInfo
 
@@ -78,7 +79,8 @@ def save_curves(path: Path, objects: Sequence[ObjectCurves]) -> None:
         for row, metrics in curves.values.items()
         for metric, values in metrics.items()
     }
-    np.savez_compressed(path, **arrays)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def load_curves(path: Path, objects: Mapping[str, ObjectInfo]) -> dict[str, ObjectCurves]:
