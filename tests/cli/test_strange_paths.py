@@ -78,7 +78,7 @@ def status_of(name: str, words: list[str]) -> int:
 
 
 def test_every_command_and_stage_is_tried() -> None:
-    stages = {f"prepare {stage}" for stage in STAGES} - {"prepare synthesize"}  # reads nothing
+    stages = {f"prepare {stage}" for stage in STAGES} - {"prepare synthesize", "prepare lpips"}  # they read nothing
     assert set(CALLS) >= set(cli.COMMANDS) - {"prepare"} | stages
 
 
