@@ -14,6 +14,7 @@ import torch
 import yaml
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from gausim.cli.sweeps.jobs import TRAINED, JobResult
 from gausim.compose.command import run_dir, run_hydra
 from gausim.compose.config import compose, instantiate
 from gausim.compose.root import conf_dir, folder_name, options
@@ -208,7 +209,12 @@ def test_jobs_of_a_sweep_never_share_a_directory(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[Path] = []
-    run_hydra(lambda config: seen.append(run_dir()), ["-m", *swept, "output_root=o"])
+
+    def job(config: DictConfig) -> JobResult:
+        seen.append(run_dir())
+        return JobResult(TRAINED, str(seen[-1]))
+
+    run_hydra(job, ["-m", *swept, "output_root=o"])
     assert len(set(seen)) == len(seen) == math.prod(len(override.split(",")) for override in swept)
     for path in seen:
         inside = path.resolve().relative_to(tmp_path / "o")
@@ -220,7 +226,12 @@ def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     seen: list[tuple[str, str]] = []
     swept = ["-m", "ablation=none,[no_mass,no_momentum]", "model=gausim"]
-    run_hydra(lambda config: seen.append((config.ablation.name, run_dir().parts[-3])), swept)
+
+    def job(config: DictConfig) -> JobResult:
+        seen.append((config.ablation.name, run_dir().parts[-3]))
+        return JobResult(TRAINED, str(run_dir()))
+
+    run_hydra(job, swept)
     assert seen == [(name, name) for name in ("none", "no_mass+no_momentum")]
 
 

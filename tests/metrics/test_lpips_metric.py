@@ -10,7 +10,7 @@ from helpers.plain import Call
 from helpers.waves import pair
 from safetensors.torch import load_file, save_file
 
-from data_prep.lpips import PUBLISHED, convert, digest, holds_published
+from data_prep.common.lpips_weights import PUBLISHED, convert, digest, holds_published
 from gausim.core import DataError
 from gausim.metrics import LPIPS
 from gausim.metrics.lpips import SHAPES, expected_shapes

@@ -32,6 +32,9 @@ class _Given(Template):
     def prepare(self, batch, units):
         return _Fixed(self.state)
 
+    def basis(self, scene_id):
+        raise NotImplementedError
+
 
 @torch.no_grad()
 def test_gradients_act_on_the_template_configuration() -> None:
