@@ -14,6 +14,7 @@ import numpy as np
 from av.error import FFmpegError
 
 from gausim.core import DataError
+from gausim.io.files import replacing
 
 H264 = "libx264"  # included in the wheels of PyAV
 # Constant rate factors of H.264 (lower is better): visually lossless, and half its size for web pages.
@@ -33,10 +34,9 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, q
     checked = _checked(path, frames)
     first = next(checked)
     height, width = (n + n % 2 for n in first.shape[:2])
-    path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     try:
-        with av.open(str(path), "w") as container:
+        with replacing(path, typed=True) as temporary, av.open(str(temporary), "w") as container:
             stream = container.add_stream(H264, rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.options = {"crf": str(quality), "preset": "medium"}
@@ -107,9 +107,9 @@ def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int
     overview = Image.fromarray(np.concatenate([np.asarray(i) for i in images[::step]], axis=1))
     palette = overview.quantize(colors=256)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    path.parent.mkdir(parents=True, exist_ok=True)
     duration = max(20, round(1000 / fps / 10) * 10)
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+    with replacing(path, typed=True) as temporary:
+        indexed[0].save(temporary, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
     return len(indexed)
 
 
