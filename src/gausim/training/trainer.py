@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +68,10 @@ def make_trainer(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
-    # Its notes on devices, and on services to log in to, would stand between those of the run; warnings stay.
+    # Its notes on devices, and on services to log in to, would stand between those of the run; its other warnings stay.
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for note in (".*isinstance.treespec, LeafSpec.", ".*number of training batches .* is smaller than the logging"):
+        warnings.filterwarnings("ignore", note)
     return Trainer(
         max_epochs=epochs,
         accelerator=settings.accelerator,
