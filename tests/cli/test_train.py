@@ -143,7 +143,8 @@ def test_a_run_may_be_evaluated_when_it_is_trained(again: list[str], monkeypatch
     status[0] = 0
     assert command.main(asked) == 0  # the finished run is evaluated, not trained again and not refused
     assert (RUN / "last.ckpt").stat().st_mtime_ns == made
-    assert [call[:3] for call in calls] == [["-m", "gausim.cli.main", "evaluate"]] * 2
+    assert [(call[0], call[2]) for call in calls] == [("-c", "evaluate")] * 2
+    assert all(f"end_with({os.getpid()})" in call[1] for call in calls)  # it ends with this process
     (RUN / "evaluation").mkdir()
     (RUN / "evaluation" / "metrics.json").write_text("{}")
     for more in ([], ["loss.static_weight=2"]):
