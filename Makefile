@@ -9,6 +9,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEMO_STAMP := $(VENV)/.demo
 # Two test processes with one thread each suit a small machine; more cores: make test WORKERS=8.
 WORKERS ?= 2
 DATA ?= data/synthetic
@@ -28,12 +29,19 @@ help: ## Show this text
 
 install: $(STAMP) ## Create .venv with the tested versions (again only after a change of pyproject.toml or constraints.txt)
 
-$(STAMP): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "error: no python3.11 or python3 found. Install Python 3.11 to 3.13, or: make install PYTHON=/path/to/python" >&2; exit 1; }
-	"$(PYTHON)" -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), f"expected Python 3.11 to 3.13, got {sys.version.split()[0]}. Use make install PYTHON=/path/to/python3.11"'
-	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
+$(STAMP): pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
 	touch $@
+
+# What the demo needs, a fraction of it all; where everything is installed, that serves.
+$(DEMO_STAMP): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[synth,view]"
+	touch $@
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "error: no python3.11 or python3 found. Install Python 3.11 to 3.13, or: make install PYTHON=/path/to/python" >&2; exit 1; }
+	"$(PYTHON)" -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), f"expected Python 3.11 to 3.13, got {sys.version.split()[0]}. Use make install PYTHON=/path/to/python3.11"'
+	"$(PYTHON)" -m venv $(VENV)
 
 test: install ## Run the default tests (without the slow ones)
 	$(PYTEST) -m "not slow" $(ARGS)
@@ -94,7 +102,7 @@ demo: $(DEMO_DATA)/.made ## From nothing to a simulator that predicts: install, 
 	$(BIN)/gausim export outputs/demo/seed_0 --format page --out outputs/demo/seed_0/page.html
 	$(BIN)/gausim report outputs/demo/seed_0
 
-$(DEMO_DATA)/.made: | install
+$(DEMO_DATA)/.made: | $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
 	$(BIN)/gausim prepare synthesize --objects gerbera --sequences 4 --kernels 12000 --resolution 256 --out $(DEMO_DATA)
 	touch $@
 
