@@ -21,12 +21,13 @@ from gausim.compose.build import load_run
 from gausim.compose.predict import run_object
 from gausim.data.images import composite
 from gausim.io.video import write_gif
+from gausim.metrics.motion import point_error
+from gausim.pictures.figures import METHOD_COLORS, SEEN_SHADE
+from gausim.pictures.frames import SEEN, UNSEEN
 from gausim.render.draw import film, to_bytes
 from gausim.training.supervision.points import attach_points
 
 LABEL, PLOT, LINE = 24, 110, 6
-SEEN, UNSEEN, SHADE = (120, 160, 200), (240, 150, 40), "#dde6ee"
-COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce")
 WHITE = torch.ones(3)
 
 
@@ -46,31 +47,26 @@ def predictions(
         if not films:
             frames = record.frames(range(record.count), [view])[:, 0]
             films["video"] = to_bytes(composite(frames, WHITE)[0]).numpy()
-            errors["static"] = _error(truth.positions - truth.rest, scene.diagonal)
+            still = truth.rest.expand_as(truth.positions)
+            errors["static"] = point_error(still, truth.positions, scene.diagonal).numpy()
         moved = predicted.positions[:, kernels] - scene.means[kernels] + truth.rest
-        errors[label] = _error(truth.positions - moved, scene.diagonal)
+        errors[label] = point_error(moved, truth.positions, scene.diagonal).numpy()
         cameras = record.cameras_of([view])
         drawn = film(item.run.renderer, scene, predicted, cameras, background=WHITE, mask=scene.foreground)
         films[label] = drawn[:, 0].numpy()
     return films, errors, item.data.train_frames.stop, item.data.fps
 
 
-def _error(difference: torch.Tensor, diagonal: float) -> np.ndarray:
-    return (100 / diagonal * difference.norm(dim=-1).mean(-1)).numpy()
-
-
 def plot(lines: dict[str, np.ndarray], frame: int, unseen: int, width: int) -> np.ndarray:
     """The errors up to a frame, (PLOT, width, 3)."""
     figure = Figure((width / 100, PLOT / 100), dpi=100)
     axes = figure.add_axes((0.07, 0.2, 0.915, 0.74))
-    count, colors = len(next(iter(lines.values()))), iter(COLORS)
-    axes.axvspan(0, unseen - 0.5, color=SHADE)
+    count, colors = len(next(iter(lines.values()))), iter(METHOD_COLORS)
+    axes.axvspan(0, unseen - 0.5, color=SEEN_SHADE)
     for label, values in lines.items():
         color = "#888888" if label == "static" else next(colors)
         axes.plot(values[: frame + 1], color=color, linewidth=1.6)
-        axes.annotate(
-            label, (min(frame, count - 1), values[frame]), (4, -3), textcoords="offset points", fontsize=7, color=color
-        )
+        axes.annotate(label, (frame, values[frame]), (4, -3), textcoords="offset points", fontsize=7, color=color)
     axes.set(xlim=(0, count + 5), ylim=(0, 1.05 * max(v.max() for v in lines.values())))
     axes.set_ylabel("3D error [%]", fontsize=7)
     axes.tick_params(labelsize=6)

@@ -17,6 +17,7 @@ from gausim.io.files import natural, write_durably
 from gausim.io.pixels import (
     ORIENTATION,
     QUARTER_TURNS,
+    SUFFIXES,
     decode,
     exif_turned,
     is_premultiplied,
@@ -24,7 +25,6 @@ from gausim.io.pixels import (
     read_header,
 )
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # Pictures that no stage reads.
 UNREAD = (".heic", ".heif", ".avif", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".gif", ".jp2")
 # Tag of the EXIF standard.

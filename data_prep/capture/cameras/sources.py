@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.common.command import Options, option
-from data_prep.common.photos import SUFFIXES, Photo, list_images, open_photo, unread_in
+from data_prep.common.photos import Photo, list_images, open_photo, unread_in
 from data_prep.common.stage import MANIFEST, read_manifest
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import (
@@ -27,6 +27,7 @@ from gausim.io.colmap import (
     read_colmap,
 )  # fmt: skip
 from gausim.io.files import natural, slashed
+from gausim.io.pixels import SUFFIXES
 from gausim.io.plain_json import read_json
 
 

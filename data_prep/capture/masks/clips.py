@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from data_prep.capture.films.film import FILMS, FilmFrames
-from data_prep.common.photos import SUFFIXES, read_picture, write_picture
+from data_prep.common.photos import read_picture, write_picture
 from gausim.core import DataError
 from gausim.io.files import natural
+from gausim.io.pixels import SUFFIXES
 
 # Pictures that stages draw for people, and the record that lies beside them.
 SHEETS = {"sync.png": "sync.json", "cameras.png": "stage.json"}

@@ -322,7 +322,7 @@ def fit(
     module: FittedModule, data: ReadyDataModule, settings: TrainerSettings, run_dir: Path, *, seed: int,
     resume: Path | None, loggers: Sequence[Any],
 ) -> dict[str, Any]:  # fmt: skip
-    """Fits a method on one rank, or goes on from a checkpoint; returns facts about the fit. Nothing is logged.
+    """Fits a method on one rank, or continues from a checkpoint; returns facts about the fit. Nothing is logged.
 
     Raises:
         ConfigError: there are several ranks.

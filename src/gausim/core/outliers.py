@@ -55,15 +55,16 @@ def outliers(scene: GaussianScene) -> list[Outliers]:
         (large, f"larger than the body (standard deviation up to {float(sizes.max()) / extent:.3g} of its extent)"),
         (far, f"outside of the body by more than {FAR:g} times its extent"),
     ]
-    opacity = scene.opacity_logits[scene.simulated]
-    unit = Outliers(torch.zeros_like(scene.simulated), f"all {len(body)} opacities lie between 0 and 1: they seem "
-                    "to be stored without the logit. Export them as 3DGS does.")  # fmt: skip
-    plain = bool(((opacity >= 0) & (opacity <= 1)).all()) and float(opacity.max() - opacity.min()) > _SPREAD
-    return [unit] * plain + [
+    faults = [
         Outliers(mask, f"{int(mask.sum())} of {scene.count} kernels are {text} (first: number "
                  f"{int(mask.nonzero()[0])}). They spoil the diagonal and the masses.")
         for mask, text in found if mask.any()
     ]  # fmt: skip
+    opacity = scene.opacity_logits[scene.simulated]
+    if bool(((opacity >= 0) & (opacity <= 1)).all()) and float(opacity.max() - opacity.min()) > _SPREAD:
+        what = f"all {len(body)} opacities lie between 0 and 1: they seem to be stored without the logit. Export them "
+        faults.insert(0, Outliers(torch.zeros_like(scene.simulated), f"{what}as 3DGS does."))
+    return faults
 
 
 def without_outliers(scene: GaussianScene) -> GaussianScene:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+# Endings of the pictures that all stages read, in small letters.
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # Tags of the EXIF standard: its sub-directory, and how the picture is to be turned; a quarter by these.
 _EXIF, ORIENTATION = 0x8769, 0x0112
 QUARTER_TURNS = (5, 6, 7, 8)

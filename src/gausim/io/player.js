@@ -102,7 +102,7 @@ class Player {
   }
 
   listen(home) {
-        const changed = (act) => { act(); this.stale = true; };
+    const changed = (act) => { act(); this.stale = true; };
     this.button.onclick = () => this.play(!this.playing);
     this.bar.oninput = () => { this.play(false); this.seek(Number(this.bar.value)); };
     home.onclick = () => changed(() => this.orbit.reset());

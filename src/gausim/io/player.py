@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from jinja2 import Template
+from jinja2 import Environment, FunctionLoader
 from torch import Tensor
 
 from gausim.core import Cameras, DataError, GaussianScene, Trajectory
@@ -46,7 +46,7 @@ def save_player(
 
 
 def rendered(name: str, scripts: Sequence[str], content: bytes, settings: dict[str, object], **texts: object) -> str:
-    """A page of the Gaussians' painter from the template NAME.html, with more scripts, and binary content as base64.
+    """A page of the Gaussians' painter: NAME.html in frame.html, with more scripts, and binary content as base64.
 
     All texts and numbers are data: ``settings`` are JSON in which no ``<`` is left, ``texts`` are escaped.
 
@@ -62,7 +62,8 @@ def rendered(name: str, scripts: Sequence[str], content: bytes, settings: dict[s
         known = json.dumps(settings, allow_nan=False).replace("<", "\\u003c")
     except ValueError as error:
         raise DataError(f"the page's settings: expected finite numbers ({error}). Train the run again.") from error
-    return Template(read(f"{name}.html"), keep_trailing_newline=True).render(
+    pages = Environment(loader=FunctionLoader(read), keep_trailing_newline=True)  # noqa: S701, escaped below
+    return pages.get_template(f"{name}.html").render(
         settings=known,
         shaders=read("splats.html"),
         script="\n".join(read(f"{part}.js") for part in ("splats", *scripts)),

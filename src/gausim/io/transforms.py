@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError
 from gausim.io.files import slashed
-from gausim.io.pixels import read_header
+from gausim.io.pixels import SUFFIXES, read_header
 from gausim.io.plain_json import read_json
 
 # Camera models without distortion, or with distortion that is checked to be zero.
@@ -35,7 +35,7 @@ LEFT_ASIDE = (
     "aabb_scale", "scale", "offset", "up", "applied_transform", "applied_scale", "ply_file_path",
     "orientation_override", "sharpness", "rotation", "depth_file_path", "colmap_im_id", "n_extra_learnable_dims",
 )  # fmt: skip
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".PNG", ".JPG", ".JPEG", ".TIF", ".TIFF")
+IMAGE_SUFFIXES = (*SUFFIXES, ".PNG", ".JPG", ".JPEG", ".TIF", ".TIFF")
 _LONGEST_NAME = 255
 _Row = tuple[float, float, float, float]
 # OpenGL cameras look along -z with y up, OpenCV cameras along +z with y down.

@@ -35,7 +35,7 @@ class RowName(NamedTuple):
 def make_rows(runs: Sequence[RunRecord]) -> list[tuple[RowName, About]]:
     """Joins runs of one name: those that differ by their seed, and on different objects by any setting.
 
-    Where a name has several configurations on one object, each is a row and is told apart.
+    Where a name has several configurations on one object, each is a row of its own.
     """
     named: dict[RowName, dict[str, About]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for run in runs:

@@ -78,7 +78,7 @@ def fit(
     module: GausSimModule, data: ReadyDataModule, settings: TrainerSettings, run_dir: Path, *, seed: int,
     resume: Path | None, loggers: Sequence[Logger],
 ) -> dict[str, Any]:  # fmt: skip
-    """Trains a simulator, or goes on from a checkpoint; returns facts about the training.
+    """Trains a simulator, or continues from a checkpoint; returns facts about the training.
 
     Raises:
         KeyboardInterrupt: it was interrupted.

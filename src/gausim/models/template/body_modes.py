@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,13 +11,46 @@ from torch import Tensor, nn
 
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.template.finite_strain import FiniteStrain
-from gausim.models.template.solid import SolidSettings, solid_body
+from gausim.models.template.solid import SolidBody, SolidSettings, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
 
 # Lowest modes of which derivatives are among the modes of a body with finite strain: 21 of 48.
 CURVED = 6
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
+
+
+class UnitModes(NamedTuple):
+    """The modes of a homogeneous body at its units, in its own axes."""
+
+    body: SolidBody
+    rest: np.ndarray  # places of the units (N, 3) [scene units]
+    pinned: np.ndarray  # which units are pinned (N,)
+    mass: np.ndarray  # of the units, that of a free one 1 in the mean (N,)
+    modes: np.ndarray  # (N, 3, M), zero at pinned units
+    gradients: np.ndarray  # displacement gradients (N, 3, 3, M) [1 / scene units], zero at pinned units
+    values: np.ndarray  # eigenvalues (M,), the first is 1
+    scale: float  # coordinate 1 of the lowest mode in typical displacements
+
+
+def unit_modes(
+    hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, solid: SolidSettings, curved: int = 0
+) -> UnitModes:
+    """The lowest modes at the units of a level, in the axes ``frame`` (3, 3) of the body; see :func:`solid_body`."""
+    level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
+    rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
+    mass = level.volume.double().numpy()
+    mass = mass / mass[~pinned].mean()
+    own = kernels.rest.double().numpy() @ frame.T
+    body = solid_body(
+        own, kernels.pinned.numpy(), rest, mass, pinned,
+        modes=modes, spacing=solid.size(own, hierarchy.diagonal), inside=solid.held_inside, curved=curved,
+    )  # fmt: skip
+    phi, slope = body.at(rest)
+    phi[pinned], slope[pinned] = 0, 0
+    values = np.maximum(body.values, 1e-6 * body.values[-1]) / body.values[0]
+    scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
+    return UnitModes(body, rest, pinned, mass, phi, slope, values, scale)
 
 
 class BodyModes(nn.Module):
@@ -46,25 +80,15 @@ class BodyModes(nn.Module):
     ) -> None:  # fmt: skip
         """Computes the constants in the axes ``frame`` (3, 3) of the body; see :class:`MaterialTemplate`."""
         super().__init__()
-        level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
-        rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
-        mass = level.volume.double().numpy()
-        mass = mass / mass[~pinned].mean()
-        own = kernels.rest.double().numpy() @ frame.T
-        size = solid.size(own, hierarchy.diagonal)
-        body = solid_body(
-            own, kernels.pinned.numpy(), rest, mass, pinned,
-            modes=modes, spacing=size, inside=solid.held_inside, curved=CURVED if finite else 0,
-        )  # fmt: skip
-        phi, slope = body.at(rest)
-        phi[pinned], slope[pinned] = 0, 0
+        body, rest, pinned, mass, phi, slope, values, self.scale = unit_modes(
+            hierarchy, finest, frame, modes=modes, solid=solid, curved=CURVED if finite else 0
+        )
         lowest = body.values[0]
         pairs = _links(rest, pinned, links)
         change = phi[pairs[1]] - phi[pairs[0]]
         offset = rest[pairs[1]] - rest[pairs[0]]
         length = np.linalg.norm(offset, axis=1)
         stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
-        values = np.maximum(body.values, 1e-6 * body.values[-1]) / lowest
         weight = 1 / values if finite else np.ones_like(values)
         even = math.sqrt((weight * body.values).sum() / lowest / max(float((weight * stretch**2).sum()), 1e-30))
         # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
@@ -86,7 +110,6 @@ class BodyModes(nn.Module):
         self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
         self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
         self.vibrations = body.vibrations
-        self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
 
 
 def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:

@@ -20,16 +20,17 @@ from torch import Tensor, nn
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits, UnitMotion
+from gausim.models.template.body_modes import unit_modes
 from gausim.models.template.modal import ModalScene
-from gausim.models.template.solid import SolidSettings, solid_body
+from gausim.models.template.solid import SolidSettings
 from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
 ROWS = 1024  # of a matrix of distances that are in memory at once
 DENSITY = "density over that at the beginning of training"
-# The modes of an even solid: their number, the spacing of its grid and the typical displacement [diagonals].
-EVEN_MODES, EVEN_SPACING, TYPICAL = 48, 0.12, 0.05
+# The modes of an even solid: their number, and the spacing of its grid [diagonals].
+EVEN_MODES, EVEN_SPACING = 48, 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,18 +287,9 @@ def even_modes(hierarchy: Hierarchy, finest: int, frame: np.ndarray) -> tuple[Te
     Coordinate 1 of the first mode is a typical displacement, a twentieth of the diagonal. ``frame`` are the axes, as
     rows.
     """
-    level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
-    rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
-    own, solid = kernels.rest.double().numpy() @ frame.T, SolidSettings(spacing=EVEN_SPACING)
-    mass = level.volume.double().numpy()
-    body = solid_body(
-        own, kernels.pinned.numpy(), rest, mass / mass[~pinned].mean(), pinned,
-        modes=EVEN_MODES, spacing=solid.size(own, hierarchy.diagonal), inside=solid.held_inside,
-    )  # fmt: skip
-    modes, gradients = body.at(rest)
-    modes[pinned], gradients[pinned] = 0, 0
-    values = np.maximum(body.values, 1e-6 * body.values[-1]) / body.values[0]
-    sizes = values**-0.5
-    scale = TYPICAL * hierarchy.diagonal * np.sqrt((~pinned).sum()) * sizes
-    made = (torch.from_numpy(np.ascontiguousarray(x)).float() for x in (modes * scale, gradients * scale, sizes))
-    return next(made), next(made), next(made)
+    found = unit_modes(hierarchy, finest, frame, modes=EVEN_MODES, solid=SolidSettings(spacing=EVEN_SPACING))
+    sizes = found.values**-0.5
+    scale = found.scale * sizes
+    made = (found.modes * scale, found.gradients * scale, sizes)
+    modes, gradients, sizes_of_modes = (torch.from_numpy(np.ascontiguousarray(x)).float() for x in made)
+    return modes, gradients, sizes_of_modes
