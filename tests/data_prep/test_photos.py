@@ -135,3 +135,31 @@ def test_masks_that_are_none_are_refused(tmp_path: Path) -> None:
             read_mask(path, (24, 16), "a")
     cv2.imwrite(str(path), np.zeros(DISC.shape, np.uint8))
     assert not read_mask(path, (24, 16), "a").any()  # the object is out of the picture
+
+
+def test_the_reference_says_what_becomes_of_every_mask(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/reference/data-set.md").read_text()
+    table = page[page.index("## Masks") : page.index("## scene.ply and its masks")]
+    rows = dict(line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| "))
+    del rows["mask"], rows["---"]
+    read = write_masks(tmp_path)
+    files = {
+        "picture with alpha": ["alpha.png", "grey alpha.tif"],
+        "grey, colour, 16 bit, palette of greys": ["values.png", "opaque.png", "deep.png", "greys.png"],
+        "values 0 and 1, or one bit": ["labels.png", "deep labels.png", "bit.png", "bit.tif"],
+        "palette of colours": ["palette.png", "palette.tif", "two bits.png"],
+        "JPEG": ["ringing.jpg"],
+    }
+    refused = {"largest value 2 to 127; another size": (2 * DISC, 31 * DISC, 32 * DISC, 127 * DISC, 255 * DISC[:4])}
+    assert set(rows) == {*files, *refused}
+    for kind, names in files.items():
+        assert "refused" not in rows[kind]
+        for name in names:
+            mask = read_mask(read[name], (24, 16), "a")
+            assert (mask[DISC] > 127).mean() > 0.9 and (mask[~DISC] < 128).mean() > 0.9, name
+    for kind, masks in refused.items():
+        assert rows[kind].startswith("refused")
+        for values in masks:
+            cv2.imwrite(str(tmp_path / "no.png"), values.astype(np.uint8))
+            with pytest.raises(DataError, match=r"no\.png: "):
+                read_mask(tmp_path / "no.png", (24, 16), "a")
