@@ -1,4 +1,4 @@
-"""Every format of `gausim export`, from a run and back from its files."""
+"""Every format of `gausim export`, from a run and from a trajectory."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers.bodies import NEURAL, make_model
-from helpers.glb_files import GlbFile
 from helpers.played import stand_in
 from helpers.toy_object import write_toy_object
 from PIL import Image
@@ -16,9 +15,8 @@ from PIL import Image
 from gausim.cli import export
 from gausim.core import ConfigError
 from gausim.core.surroundings import Surroundings
-from gausim.io.ply import save_scene
-from gausim.io.ply_sequence import load_ply_sequence
-from gausim.io.trajectory import load_trajectory
+from gausim.io.ply import load_scene, save_scene
+from gausim.io.trajectory import save_trajectory
 from gausim.io.video import read_video
 from gausim.models.initial_state import ModalInitialStates
 from gausim.ops.deformed_scene import deformed_scene
@@ -33,47 +31,26 @@ def run(played: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     return played
 
 
-def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, capsys) -> None:
-    scene, source = run.module.model.scenes[0], str(run.run_dir)
-    options = ["--sequences", "seq_001", "--frames", "6"]
-    assert export.main([source, "--format", "safetensors", *options]) == 0
-    assert "wrote toy_seq_001.safetensors: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
-    trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.predict(1, 5)
-    for name in ("positions", "deformation_gradients", "rotations", "unit_of_kernel"):
-        assert torch.equal(getattr(trajectory, name), getattr(whole, name))
-
-    assert export.main([source, "--format", "ply", "--out", "a", *options]) == 0
+def test_ply_files_of_a_run_and_of_a_trajectory_hold_every_frame(run, tmp_path: Path, capsys) -> None:
+    scene, whole = run.module.model.scenes[0], run.module.predict(1, 5)
+    options = ["--format", "ply", "--sequences", "seq_001", "--frames", "6"]
+    assert export.main([str(run.run_dir), *options, "--out", "a"]) == 0
+    assert "wrote a: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
     save_scene(scene, "rest.ply")
-    stored = ["toy_seq_001.safetensors", "--scene", "rest.ply"]
-    assert export.main([*stored, "--format", "ply", "--out", "b"]) == 0
+    save_trajectory("toy_seq_001.safetensors", whole)
+    stored = ["toy_seq_001.safetensors", "--scene", "rest.ply", "--format", "ply"]
+    assert export.main([*stored, "--out", "b"]) == 0
+    assert export.main([*stored, "--out", "c", "--every", "2"]) == 0
     expected = [
         deformed_scene(scene, *state, whole.unit_of_kernel)
         for state in zip(whole.positions, whole.deformation_gradients, whole.rotations, strict=True)
     ]
-    for folder in ("a", "b"):
-        scenes, count, fps = load_ply_sequence(folder)
-        assert count == 6 and fps == 24.0
-        for read, made in zip(scenes, expected, strict=True):
+    for folder, every in (("a", 1), ("b", 1), ("c", 2)):
+        files = sorted((tmp_path / folder).glob("*.ply"))
+        assert json.loads((tmp_path / folder / "toy_seq_001.json").read_text())["fps"] == 24 / every
+        for path, made in zip(files, expected[::every], strict=True):
+            read = load_scene(path, masks=tmp_path / folder / "toy_seq_001.masks.npz")
             assert all(torch.equal(getattr(read, n), getattr(made, n)) for n in FIELDS)
-    assert (tmp_path / "a" / "toy_seq_001_0006.ply").is_file()
-    assert export.main(["a", "--format", "ply", "--out", "c", "--every", "2"]) == 0
-    scenes, count, fps = load_ply_sequence("c")
-    assert count == 3 and fps == 12.0 and [torch.equal(s.means, expected[2 * i].means) for i, s in enumerate(scenes)]
-
-
-def test_frames_without_units_make_no_trajectory(run) -> None:
-    assert export.main([str(run.run_dir), "--format", "ply", "--frames", "2", "--out", "p"]) == 0
-    for form in ("safetensors", "motion", "html"):
-        with pytest.raises(ConfigError, match=f"--format {form}: p holds frames without units"):
-            export.main(["p", "--format", form])
-
-
-def test_usd(run) -> None:
-    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core (extra usd)")
-    assert export.main([str(run.run_dir), "--format", "usd", "--frames", "4", "--out", "m.usdc"]) == 0
-    stage = usd.Stage.Open("m.usdc")
-    positions = stage.GetDefaultPrim().GetAttribute("positions")
-    assert torch.equal(torch.tensor(positions.Get(2)), run.module.predict(0, 3).positions[2])
 
 
 def test_pictures(run) -> None:
@@ -91,22 +68,11 @@ def test_pictures(run) -> None:
         assert image.n_frames == 2 and image.size == (40, 40) and min(image.convert("RGB").getpixel((0, 0))) > 245
 
 
-def test_a_compact_motion_and_its_page(run, capsys) -> None:
-    source = str(run.run_dir)
-    assert export.main([source, "--format", "motion", "--frames", "6", "--every", "2"]) == 0
-    assert "wrote toy_seq_000.motion.glb: 3 frames of 36 kernels at 12 frames" in capsys.readouterr().out
-    GlbFile(Path("toy_seq_000.motion.glb")).check_splats(run.module.model.scenes[0], degree=0)
-    assert export.main([source, "--format", "html", "--frames", "6", "--cameras", "cam_1"]) == 0
+def test_the_page_of_a_motion_begins_at_the_camera(run) -> None:
+    assert export.main([str(run.run_dir), "--format", "html", "--frames", "6", "--cameras", "cam_1"]) == 0
     record, page = run.objects[0].sequences[0], Path("toy_seq_000.html").read_text()
     eye = json.loads(page.split('id="settings">')[1].split("<")[0])["camera"]["eye"]
     assert eye == pytest.approx(record.cameras_of(["cam_1"]).centers[0].tolist(), abs=1e-6)
-
-
-def test_frames_as_gltf(run) -> None:
-    assert export.main([str(run.run_dir), "--format", "gltf", "--frames", "4", "--every", "2", "--out", "g"]) == 0
-    assert sorted(path.name for path in Path("g").iterdir()) == [f"toy_seq_000_000{i}.glb" for i in (1, 2)]
-    found = GlbFile(Path("g/toy_seq_000_0002.glb")).attribute("POSITION")
-    assert torch.equal(found, run.module.predict(0, 3).positions[2])
 
 
 def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
-"""Motions as one compact file and as a page, and Gaussians as glTF: what they hold, and what is refused."""
+"""Motions as a page: what it holds, and what is refused."""
 
+import base64
 import json
 import re
 from dataclasses import replace
@@ -8,91 +9,79 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.glb_files import GlbFile
 from helpers.unit_motions import unit_motion, unit_scene
 
-from gausim.core import DataError, DivergenceError, GaussianScene
-from gausim.io.gltf import save_gltf_frames
-from gausim.io.motion import KEY, save_motion
+from gausim.core import DataError, DivergenceError, GaussianScene, Trajectory
 from gausim.io.player import save_player
 from gausim.ops.orbit import orbit_cameras
 
 
-def positions_in(path: Path, scene: GaussianScene) -> torch.Tensor:
-    """Positions of all kernels in all frames, as docs/reference/motion-file.md describes them; the rest is checked."""
-    glb = GlbFile(path)
-    facts = glb.document["extras"][KEY]
-    glb.check_splats(scene, degree=0)
-    frames, units, views = facts["frames"], facts["units"], facts["views"]
-    masks = torch.from_numpy(glb.view(views["masks"], "u1").copy())
-    for bit, name in enumerate(("simulated", "pinned", "foreground")):
-        assert torch.equal((masks >> bit & 1).bool(), getattr(scene, name))
-    levels = torch.from_numpy(glb.view(views["sh"], "i1").reshape(scene.count, -1, 3).astype("f4"))
-    high = levels * torch.tensor(facts["sh_scales"])[:, None]
+def positions_in(page: Path, scene: GaussianScene) -> torch.Tensor:
+    """Positions of all kernels in all frames, as a page holds them; the rest scene is checked."""
+    text = page.read_text()
+    facts, content = (text.split(f'id="{name}">')[1].split("</script>")[0] for name in ("settings", "content"))
+    facts, data = json.loads(facts), base64.b64decode(content)
+    arrays = {
+        name: torch.from_numpy(np.frombuffer(data, f"<{kind}", size, offset).astype("i8" if kind == "u4" else "f4"))
+        for name, (kind, offset, size) in facts["arrays"].items()
+    }
+    frames, units = facts["frames"], facts["units"]
+    assert torch.equal(arrays["rest"].reshape(-1, 3), scene.means)
+    assert torch.allclose(arrays["scales"].reshape(-1, 3).log(), scene.log_scales, atol=1e-6)
+    quats = torch.nn.functional.normalize(scene.quats, dim=-1)
+    assert torch.allclose(arrays["quats"].reshape(-1, 4)[:, [3, 0, 1, 2]], quats, atol=1e-3)
+    assert torch.allclose(arrays["opacities"], scene.opacity_logits.sigmoid(), atol=1e-3)
+    high = arrays["sh"].reshape(scene.count, -1, 3) * torch.tensor(facts["sh_scales"])[:, None]
     assert torch.allclose(high, scene.sh[:, 1:], atol=float(scene.sh.abs().max()) / 253)  # half of 1 in 127 levels
-    rest = torch.from_numpy(glb.view(views["rest_centres"], "<f4").reshape(units, 3).copy())
-    origins = torch.from_numpy(glb.view(views["origins"], "<f4").reshape(frames, 1, 3).copy())
-    moved = torch.from_numpy(glb.view(views["units"], "<f2").reshape(frames, units, 12).astype("f4"))
-    unit = torch.from_numpy(glb.view(views["unit_of_kernel"], "<u2").astype("i8"))
+    rest, unit = arrays["centres"].reshape(units, 3), arrays["unit_of_kernel"]
+    moved = arrays["moved"].reshape(frames, units, 12)
     gradients = torch.eye(3) + moved[..., 3:].reshape(frames, units, 3, 3)
     offset = (scene.means - rest[unit])[..., None]
-    shift = origins + facts["diagonal"] * moved[..., :3]
+    shift = arrays["origins"].reshape(frames, 1, 3) + facts["diagonal"] * moved[..., :3]
     return rest[unit] + shift[:, unit] + (gradients[:, unit] @ offset)[..., 0]
+
+
+def write(path: Path, scene: GaussianScene, made: Trajectory) -> Path:
+    save_player(path, scene, made, orbit_cameras(scene.means, azimuths=[30.0]))
+    return path
 
 
 @pytest.mark.parametrize(("degree", "travel"), [(0, 0.0), (2, 0.0), (3, 40.0)])
 def test_a_motion_comes_back(degree: int, travel: float, tmp_path: Path) -> None:
     scene = unit_scene(degree=degree)
     made = unit_motion(scene, travel=travel)
-    save_motion(tmp_path / "m.motion.glb", scene, made)
-    error = (positions_in(tmp_path / "m.motion.glb", scene) - made.positions).norm(dim=-1)
+    page = write(tmp_path / "m.html", scene, made)
+    error = (positions_in(page, scene) - made.positions).norm(dim=-1)
     assert float(error.max()) < 1e-3 * scene.diagonal
-    facts = GlbFile(tmp_path / "m.motion.glb").document["extras"][KEY]
-    assert facts["fps"] == made.fps and facts["volume_scale"] == scene.volume_scale
-    size = (tmp_path / "m.motion.glb").stat().st_size
-    longer = unit_motion(scene, frames=105, travel=travel)
-    save_motion(tmp_path / "long.motion.glb", scene, longer)
-    # Twelve half floats of every unit and an origin per frame, whatever the number of kernels.
-    added = (tmp_path / "long.motion.glb").stat().st_size - size
-    assert abs(added - 100 * (6 * 24 + 12)) < 200
+    longer = write(tmp_path / "long.html", scene, unit_motion(scene, frames=105, travel=travel))
+    # Twelve half floats of every unit and an origin per frame, whatever the number of kernels, in base64.
+    added = (longer.stat().st_size - page.stat().st_size) * 3 / 4
+    assert abs(added - 100 * (6 * 24 + 12)) < 250
 
 
 def test_still_kernels_do_not_move_and_strays_get_units_of_their_own(tmp_path: Path) -> None:
     scene = unit_scene()
     made = unit_motion(scene)
     made.positions[2:, 17] = made.positions[1, 17]  # held by hand
-    save_motion(tmp_path / "m.motion.glb", scene, made)
-    found = positions_in(tmp_path / "m.motion.glb", scene)
+    page = write(tmp_path / "m.html", scene, made)
+    found = positions_in(page, scene)
     assert torch.allclose(found[:, :5], scene.means[:5].expand(5, -1, -1), atol=1e-6)
     assert float((found - made.positions).norm(dim=-1).max()) < 1e-3 * scene.diagonal
-    assert GlbFile(tmp_path / "m.motion.glb").document["extras"][KEY]["units"] > 6
+    assert json.loads(page.read_text().split('id="settings">')[1].split("</script>")[0])["units"] > 6
 
 
 def test_what_is_no_motion_of_the_scene_is_not_written(tmp_path: Path) -> None:
-    scene, path = unit_scene(), tmp_path / "m.motion.glb"
+    scene, path = unit_scene(), tmp_path / "m.html"
     made = unit_motion(scene)
     with pytest.raises(DataError, match="has 60 kernels, the trajectory 50"):
-        save_motion(path, scene, unit_motion(unit_scene(count=50)))
+        write(path, scene, unit_motion(unit_scene(count=50)))
     broken = replace(made, positions=made.positions.clone())
     broken.positions[3, 9] = torch.nan
     with pytest.raises(DivergenceError, match="frame 3 is not finite"):
-        save_motion(path, scene, broken)
+        write(path, scene, broken)
     with pytest.raises(DataError, match="half floats"):
-        save_motion(path, scene, replace(made, deformation_gradients=1e5 * made.deformation_gradients))
+        write(path, scene, replace(made, deformation_gradients=1e5 * made.deformation_gradients))
     assert not path.exists()
-
-
-def test_frames_as_gltf_come_back_and_a_reader_that_is_not_ours_opens_them(tmp_path: Path) -> None:
-    scenes = [unit_scene(), unit_scene(count=40, degree=3)]
-    assert save_gltf_frames(tmp_path, "toy", scenes) == 2
-    for number, scene in enumerate(scenes, start=1):
-        glb = GlbFile(tmp_path / f"toy_000{number}.glb")
-        glb.check_splats(scene)
-        assert glb.document["nodes"][0]["rotation"][0] < 0  # z up is turned to y up
-    trimesh = pytest.importorskip("trimesh", reason="needs trimesh (extra view)")
-    cloud = next(iter(trimesh.load(tmp_path / "toy_0001.glb").geometry.values()))
-    assert np.array_equal(cloud.vertices.astype(np.float32), scenes[0].means.numpy())
-    assert np.abs(cloud.colors[:, 3] - 255 * torch.sigmoid(scenes[0].opacity_logits).numpy()).max() <= 0.51
 
 
 def test_a_page_holds_the_motion_and_refuses_the_network(tmp_path: Path) -> None:

@@ -6,17 +6,6 @@ const BISECTIONS = 10, CORRECTIONS = { solid: 4, springs: 3 };
 const MIN_DETERMINANT = 0.2; // units that are flatter than this are drawn undeformed
 const LEAST_LEFT = 0.1; // least part of an impulse that damping leaves in its first frame
 
-// Typed arrays of the page by name, from the binary content and its index.
-function readArrays(base64, index) {
-  const bytes = Uint8Array.from(atob(base64.trim()), (c) => c.charCodeAt(0)).buffer;
-  const kinds = { f4: Float32Array, f2: Uint16Array, u4: Uint32Array, i2: Int16Array, i1: Int8Array };
-  const read = ([kind, offset, size]) => {
-    const values = new kinds[kind](bytes, offset, size);
-    return kind === "f2" ? Float32Array.from(values, (bits) => HALF[bits]) : values;
-  };
-  return Object.fromEntries(Object.entries(index).map(([name, place]) => [name, read(place)]));
-}
-
 class Body {
   constructor(arrays, facts) {
     const { modes, units, diagonal } = facts;

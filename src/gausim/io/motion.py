@@ -1,15 +1,13 @@
-"""A motion as one GLB file: the rest scene as glTF, and twelve half floats per unit and frame.
+"""A motion as that of its units: twelve numbers per unit and frame.
 
 Every kernel follows exactly one unit, x_k = x_c + G_c (X_k - X_c) with covariance G_c S_k G_c^T, so that the units'
-centres and deformation gradients are the whole motion. A reader of glTF shows the rest scene with its base colours; the
-motion is in ``extras.gausim_motion``, see docs/reference/motion-file.md for the layout.
+centres and deformation gradients are the whole motion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,15 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gausim.core import DataError, DivergenceError, GaussianScene, Trajectory
-from gausim.io.files import write_durably
-from gausim.io.gltf import Glb, splat_glb
 
-KEY, VERSION = "gausim_motion", 1
 # Kernels that leave the motion of their unit by more than this get a unit of their own [diagonals].
 _FOLLOWS = 2e-4
-# Levels of the stored spherical harmonics above degree 0, each way.
-_LEVELS = 127
-_MASKS = ("simulated", "pinned", "foreground")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,56 +58,37 @@ class UnitMotion:
             yield rest + moved[unit] + (gradients[unit] @ offset)[..., 0]
 
 
-def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> Glb:
-    """The document of a motion, see :func:`save_motion`."""
+def motion_arrays(scene: GaussianScene, trajectory: Trajectory) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """Arrays and numbers of a motion, besides the rest scene: twelve numbers per unit and frame.
+
+    ``centres`` (N, 3) are the units' centres at rest and ``origins`` (F, 3) what all displacements of a frame have in
+    common [scene units], ``moved`` (F, N, 12) the rest of the displacements [diagonals] and G - I.
+
+    Raises:
+        DataError: the trajectory is of another scene, or goes beyond half floats.
+        DivergenceError: a frame is not finite.
+    """
     motion = UnitMotion.of(scene, trajectory)
-    count, glb = len(motion.rest_centres), splat_glb(scene, up=up, degree=0)
     moved = motion.displacements
     # Half floats are relative: what all units have in common is stored apart where a body travels far.
     origins = (moved.amax(1) + moved.amin(1)) / 2
     if float(moved.abs().max()) < scene.diagonal:
         origins = torch.zeros_like(origins)
     parts = (moved - origins[:, None]) / scene.diagonal, (motion.deformation_gradients - torch.eye(3)).flatten(2)
-    units = torch.cat(parts, 2).half().numpy().astype("<f2")
-    if not np.isfinite(units).all():
-        raise DataError(f"{scene.name}: the motion is beyond half floats (65504). Export it as ply or safetensors.")
-    masks = sum(getattr(scene, name).cpu().int() << bit for bit, name in enumerate(_MASKS))
-    levels, scales = quantised_harmonics(scene)
-    views = {
-        "rest_centres": motion.rest_centres.numpy().astype("<f4"),
-        "origins": origins.numpy().astype("<f4"),
-        "units": units,
-        "unit_of_kernel": motion.unit_of_kernel.numpy().astype("<u2" if count <= 1 << 16 else "<u4"),
-        "masks": np.asarray(masks, np.uint8),
-        "sh": levels,
+    units = torch.cat(parts, 2)
+    if not bool(torch.isfinite(units.half()).all()):
+        raise DataError(f"{scene.name}: the motion is beyond half floats (65504). Export it as ply.")
+    values = {
+        "centres": motion.rest_centres,
+        "origins": origins,
+        "moved": units,
+        "unit_of_kernel": motion.unit_of_kernel,
     }
-    facts = {
-        "version": VERSION, "fps": trajectory.fps, "frames": trajectory.frames, "units": count,
-        "diagonal": scene.diagonal, "volume_scale": scene.volume_scale, "sh_scales": scales,
+    facts: dict[str, object] = {
+        "fps": trajectory.fps, "frames": trajectory.frames, "units": len(motion.rest_centres),
+        "diagonal": scene.diagonal,
     }  # fmt: skip
-    indices = {name: glb.add_view(array) for name, array in views.items()}
-    glb.document["extras"] = {KEY: {**facts, "views": indices}}
-    return glb
-
-
-def quantised_harmonics(scene: GaussianScene) -> tuple[np.ndarray, list[float]]:
-    """Coefficients above degree 0 as bytes (K, C, 3), and the value of one step of each of the C."""
-    high = scene.sh[:, 1:].detach().cpu().float()
-    scales = high.abs().amax((0, 2)) / _LEVELS
-    return (high / scales.clamp_min(1e-30)[:, None]).round().numpy().astype(np.int8), scales.tolist()
-
-
-def save_motion(path: Path | str, scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> None:
-    """Writes a rest scene and its motion; replaces the file atomically. ``up`` (y or z) is for readers of glTF.
-
-    Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre
-    and deformation gradient with 11 significant bits. Lost: rotations, which are those of the deformation gradients.
-
-    Raises:
-        DataError: the trajectory is of another scene, or goes beyond half floats or the size of a GLB.
-        DivergenceError: a frame is not finite.
-    """
-    write_durably(Path(path), motion_glb(scene, trajectory, up=up).to_bytes())
+    return {name: value.numpy() for name, value in values.items()}, facts
 
 
 def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) -> UnitMotion:

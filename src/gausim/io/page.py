@@ -7,17 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.core import Cameras, DataError, GaussianScene
+from gausim.core import Cameras, GaussianScene
 from gausim.io.files import write_durably
-from gausim.io.motion import quantised_harmonics
-from gausim.io.player import rendered, view_settings
+from gausim.io.player import packed, rendered, splat_arrays, view_settings
 
-# Arrays that are stored as half floats: none of them drives the motion.
-HALF = ("quats", "opacities", "base", "gradients", "cells")
 # What is in -1..1 is stored in 16 bits, in equal steps: near 1 these are finer than half floats.
 STEPS = 32767
 
@@ -71,20 +67,13 @@ def save_page(
     Raises:
         DataError: a number is not finite.
     """
-    levels, scales = quantised_harmonics(page.scene)
+    splats, scales = splat_arrays(page.scene)
     step = dict(page.step)
     if "quadratic" in step:
         step["quadratic"], step["pair_scales"] = _scaled(step["quadratic"])
         step["cells"] = page.scene.diagonal * step["cells"]
-    parts = {"splats": _splats(page, levels), "modes": _modes(page), "step": step}
-    index, content, sizes = dict[str, list[object]](), bytearray(), dict[str, int]()
-    for part, arrays in parts.items():
-        begin = len(content)
-        for name, array in arrays.items():
-            data, kind = _packed(name, array)
-            index[name] = [kind, len(content), array.size]
-            content += data
-        sizes[part] = (len(content) - begin) * 4 // 3
+    splats["unit_of_kernel"] = page.unit_of_kernel.cpu().numpy()
+    content, index, sizes = packed({"splats": splats, "modes": _modes(page), "step": step})
     scene = page.scene
     settings = {
         **view_settings(scene, camera, up=up, background=background),
@@ -94,19 +83,9 @@ def save_page(
         "starts": [vars(start) for start in page.starts], **page.numbers,
     }  # fmt: skip
     scripts = ("algebra", "laws", "body", "page")
-    text = rendered("page", scripts, bytes(content), settings, title=f"{scene.name} - gausim").encode()
+    text = rendered("page", scripts, content, settings, title=f"{scene.name} - gausim").encode()
     write_durably(Path(path), text)
     return {**sizes, "code": len(text) - sum(sizes.values())}
-
-
-def _splats(page: ElasticPage, levels: np.ndarray) -> dict[str, np.ndarray]:
-    scene = page.scene
-    values = {
-        "rest": scene.means, "quats": torch.nn.functional.normalize(scene.quats, dim=-1).roll(-1, -1),  # xyzw
-        "scales": scene.log_scales.exp(), "opacities": scene.opacity_logits.sigmoid(), "base": scene.sh[:, 0],
-        "unit_of_kernel": page.unit_of_kernel,
-    }  # fmt: skip
-    return {name: value.detach().cpu().numpy() for name, value in values.items()} | {"sh": levels}
 
 
 def _modes(page: ElasticPage) -> dict[str, np.ndarray]:
@@ -123,21 +102,3 @@ def _scaled(triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = np.tril_indices(count)
     roots = np.sqrt(np.maximum(triangle[rows == columns], np.finfo(np.float32).tiny))
     return (STEPS * triangle / (roots[rows] * roots[columns])).round().astype(np.int16), roots / STEPS**0.5
-
-
-def _packed(name: str, array: np.ndarray) -> tuple[bytes, str]:
-    """Bytes of an array, padded to a multiple of 12, and its type.
-
-    Raises:
-        DataError: a number is not finite, or beyond half floats.
-    """
-    if array.dtype.kind == "f":
-        array, kind = (array.astype("<f2"), "f2") if name in HALF else (array.astype("<f4"), "f4")
-        if not np.isfinite(array).all():
-            raise DataError(f"the page's '{name}': expected finite numbers, as half floats below 65504. Train again.")
-    elif array.dtype.itemsize > 2:
-        array, kind = array.astype("<u4"), "u4"
-    else:
-        kind = f"i{array.dtype.itemsize}"
-    data = np.ascontiguousarray(array).tobytes()
-    return data + bytes(-len(data) % 12), kind

@@ -2,37 +2,22 @@
 
 // ---- The file -------------------------------------------------------------------------------------------------------
 
-function readMotion(base64) {
-  const bytes = Uint8Array.from(atob(base64.trim()), (c) => c.charCodeAt(0));
-  const words = new DataView(bytes.buffer), textSize = words.getUint32(12, true);
-  const gltf = JSON.parse(new TextDecoder().decode(bytes.subarray(20, 20 + textSize)));
-  const view = (index, Kind) => {
-    const { byteOffset = 0, byteLength } = gltf.bufferViews[index], start = 28 + textSize + byteOffset;
-    return new Kind(bytes.buffer.slice(start, start + byteLength));
-  };
-  const facts = gltf.extras.gausim_motion, attributes = gltf.meshes[0].primitives[0].attributes;
-  const read = (name) => view(gltf.accessors[attributes[name]].bufferView, Float32Array);
-  const splat = (name) => read("KHR_gaussian_splatting:" + name);
-  return {
-    ...facts,
-    rest: read("POSITION"), rotations: splat("ROTATION"), scales: splat("SCALE"), opacities: splat("OPACITY"),
-    base: splat("SH_DEGREE_0_COEF_0"), sh: view(facts.views.sh, Int8Array),
-    restCentres: view(facts.views.rest_centres, Float32Array), origins: view(facts.views.origins, Float32Array),
-    halves: view(facts.views.units, Uint16Array),
-    unitOf: view(facts.views.unit_of_kernel, facts.units <= 65536 ? Uint16Array : Uint32Array),
-  };
+function readMotion(facts) {
+  const { unit_of_kernel: unitOf, quats: rotations, centres: restCentres, ...arrays } =
+    readArrays(content("content"), facts.arrays);
+  return { ...facts, ...arrays, unitOf, rotations, restCentres };
 }
 
 // ---- The motion -----------------------------------------------------------------------------------------------------
 
 // Centre, G and Q of every unit at a time between two frames, 24 floats: rows of G with the centre beside, rows of Q.
 function unitsAt(motion, time, out) {
-  const { units, frames, diagonal, halves, origins, restCentres } = motion;
+  const { units, frames, diagonal, moved, origins, restCentres } = motion;
   const first = Math.min(Math.floor(time), frames - 1), second = Math.min(first + 1, frames - 1), part = time - first;
   const a = first * units * 12, b = second * units * 12, now = new Float64Array(12);
   for (let u = 0; u < units; u++) {
     for (let i = 0; i < 12; i++) {
-      now[i] = (1 - part) * HALF[halves[a + 12 * u + i]] + part * HALF[halves[b + 12 * u + i]];
+      now[i] = (1 - part) * moved[a + 12 * u + i] + part * moved[b + 12 * u + i];
     }
     for (let i = 0; i < 3; i++) {
       const origin = (1 - part) * origins[3 * first + i] + part * origins[3 * second + i];
@@ -119,4 +104,7 @@ class Player {
   }
 }
 
-window.player = reported(() => new Player(readMotion(content("content")), JSON.parse(content("settings"))));
+window.player = reported(() => {
+  const settings = JSON.parse(content("settings"));
+  return new Player(readMotion(settings), settings);
+});

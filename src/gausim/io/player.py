@@ -6,10 +6,11 @@ import base64
 import html
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from jinja2 import Environment, FunctionLoader
@@ -17,7 +18,12 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError, GaussianScene, Trajectory
 from gausim.io.files import write_durably
-from gausim.io.motion import motion_glb
+from gausim.io.motion import motion_arrays
+
+# Arrays that are stored as half floats.
+HALF = ("quats", "opacities", "base", "gradients", "cells", "moved")
+# Levels of the stored spherical harmonics above degree 0, each way.
+_LEVELS = 127
 
 
 def save_player(
@@ -29,7 +35,7 @@ def save_player(
     up: str = "z",
     background: Float[Tensor, " 3"] | None = None,
 ) -> None:
-    """Writes a page with time bar, speed, loop and orbit; in it is the file of :func:`gausim.io.motion.save_motion`.
+    """Writes a page with time bar, speed, loop and orbit.
 
     The page begins with place and field of view of the one ``camera``, looking at the point of its axis that is
     nearest to the scene's middle. The vertical axis ``up`` is x, y or z, with a minus sign where it points down. It
@@ -39,8 +45,11 @@ def save_player(
         DataError: the trajectory is of another scene, or goes beyond half floats.
         DivergenceError: a frame is not finite.
     """
-    content = motion_glb(scene, trajectory, up=up).to_bytes()
-    settings = view_settings(scene, camera, up=up, background=background)
+    motion, facts = motion_arrays(scene, trajectory)
+    splats, scales = splat_arrays(scene)
+    content, index, _ = packed({"splats": splats, "motion": motion})
+    settings = view_settings(scene, camera, up=up, background=background) | facts
+    settings |= {"arrays": index, "sh_scales": scales}
     page = rendered("player", ("player",), content, settings, title=f"{scene.name} - gausim")
     write_durably(Path(path), page.encode())
 
@@ -84,3 +93,53 @@ def view_settings(
     fov = 2 * math.atan(min(camera.width, camera.height) / (2 * float(camera.Ks[0, 1, 1])))
     view = {"eye": eye.tolist(), "target": target.tolist(), "up": vertical.tolist(), "fov": fov}
     return {"camera": view, "background": [0.0, 0.0, 0.0] if background is None else background.tolist()}
+
+
+def splat_arrays(scene: GaussianScene) -> tuple[dict[str, np.ndarray], list[float]]:
+    """Arrays of a rest scene, and the value of one step of each coefficient above degree 0, which are bytes."""
+    high = scene.sh[:, 1:].detach().cpu().float()
+    scales = high.abs().amax((0, 2)) / _LEVELS
+    levels = (high / scales.clamp_min(1e-30)[:, None]).round().to(torch.int8)
+    values = {
+        "rest": scene.means, "quats": torch.nn.functional.normalize(scene.quats, dim=-1).roll(-1, -1),  # xyzw
+        "scales": scene.log_scales.exp(), "opacities": scene.opacity_logits.sigmoid(), "base": scene.sh[:, 0],
+        "sh": levels,
+    }  # fmt: skip
+    return {name: value.detach().cpu().numpy() for name, value in values.items()}, scales.tolist()
+
+
+def packed(
+    parts: Mapping[str, Mapping[str, np.ndarray]],
+) -> tuple[bytes, dict[str, list[object]], dict[str, int]]:
+    """Arrays of several parts as binary content, its index (type, first byte and count by name), and bytes by part.
+
+    Raises:
+        DataError: a number is not finite, or beyond half floats.
+    """
+    content, index, sizes = bytearray(), dict[str, list[object]](), dict[str, int]()
+    for part, arrays in parts.items():
+        begin = len(content)
+        for name, array in arrays.items():
+            data, kind = _packed(name, array)
+            index[name] = [kind, len(content), array.size]
+            content += data
+        sizes[part] = (len(content) - begin) * 4 // 3
+    return bytes(content), index, sizes
+
+
+def _packed(name: str, array: np.ndarray) -> tuple[bytes, str]:
+    """Bytes of an array, padded to a multiple of 12, and its type.
+
+    Raises:
+        DataError: a number is not finite, or beyond half floats.
+    """
+    if array.dtype.kind == "f":
+        array, kind = (array.astype("<f2"), "f2") if name in HALF else (array.astype("<f4"), "f4")
+        if not np.isfinite(array).all():
+            raise DataError(f"the page's '{name}': expected finite numbers, as half floats below 65504. Train again.")
+    elif array.dtype.itemsize > 2:
+        array, kind = array.astype("<u4"), "u4"
+    else:
+        kind = f"i{array.dtype.itemsize}"
+    data = np.ascontiguousarray(array).tobytes()
+    return data + bytes(-len(data) % 12), kind

@@ -12,6 +12,17 @@ const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
 
 // ---- The lists -------------------------------------------------------------------------------------------------------
 
+// Typed arrays of the page by name, from the binary content and its index.
+function readArrays(base64, index) {
+  const bytes = Uint8Array.from(atob(base64.trim()), (c) => c.charCodeAt(0)).buffer;
+  const kinds = { f4: Float32Array, f2: Uint16Array, u4: Uint32Array, i2: Int16Array, i1: Int8Array };
+  const read = ([kind, offset, size]) => {
+    const values = new kinds[kind](bytes, offset, size);
+    return kind === "f2" ? Float32Array.from(values, (bits) => HALF[bits]) : values;
+  };
+  return Object.fromEntries(Object.entries(index).map(([name, place]) => [name, read(place)]));
+}
+
 // The rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2; the last where G has no inverse.
 function rotationOf(m, at) {
   let a = m[at], b = m[at + 1], c = m[at + 2], d = m[at + 4], e = m[at + 5], f = m[at + 6];
