@@ -20,6 +20,7 @@ CASES = {
     "render": "the CPU renderer against plain torch, threads, views, compilation",
     "step": "one predicted frame at the paper's size, with and without hierarchy, and of the other models",
     "train": "whole optimiser steps, part by part; KEY=VALUE as in `gausim train`",
+    "scale": "a training at the paper's size, stage by stage, and the whole for 30 sequences; KEY=VALUE likewise",
     "teach": "single steps and rollouts of the pure network on tracked motion: pairs per second",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed: simulated frames per second, from the force to the browser's bytes",
@@ -36,7 +37,7 @@ def main(argv: list[str]) -> int:
     rows: list[Row] = []
     for name in CASES if arguments.case == "all" else [arguments.case]:
         print(f"measuring {name} ...", file=sys.stderr, flush=True)
-        more = {"overrides": arguments.overrides} if name == "train" else {}
+        more = {"overrides": arguments.overrides} if name in ("train", "scale") else {}
         try:
             rows += importlib.import_module(f"benchmarks.{name}").run(options, **more)
         except DataError as error:
@@ -74,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("case", choices=[*CASES, "all"], metavar="CASE", help="one of the cases above, or all")
-    add("overrides", nargs="*", metavar="KEY=VALUE", help="training configuration of the case train")
+    add("overrides", nargs="*", metavar="KEY=VALUE", help="training configuration of the cases train and scale")
     add("--json", action="store_true", help='print one JSON object: {"machine": ..., "rows": [...]}')
     add("--quick", action="store_true", help="tiny sizes: to see that it works, not to quote")
     add("--threads", type=int, default=1, help="threads of torch and the renderer; default %(default)s")

@@ -41,7 +41,7 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
 
 
 @dataclass
-class _Case:
+class Case:
     """A module with a batch and an optimiser of rate zero, so that all steps are equal."""
 
     module: GausSimModule
@@ -49,7 +49,8 @@ class _Case:
     optimizer: Optimizer
 
     @staticmethod
-    def of(module: GausSimModule, data: ReadyDataModule, options: Options, steps: int) -> _Case:
+    def of(module: GausSimModule, data: ReadyDataModule, options: Options, steps: int) -> Case:
+        """A case of the first sequences, with T = ``steps``."""
         chosen = range(min(SEQUENCES, len(data.index)))
         views = [data.index.objects[data.index.entries[i][0]].train_views for i in chosen]
         frames = range(steps + 1)
@@ -59,7 +60,7 @@ class _Case:
         optimizer = module.configure_optimizers()
         for group in optimizer.param_groups:
             group["lr"] = 0.0
-        return _Case(module, samples, optimizer)
+        return Case(module, samples, optimizer)
 
     def step(self) -> None:
         """One optimiser step without the static loss, which only some batches have."""
@@ -76,14 +77,14 @@ def measure(
     data.setup("fit")
     longest = (data.plan.t_max if data.plan else None) or 1
     steps = min(3, longest) if options.quick else longest
-    case = _Case.of(module, data, options, steps)
+    case = Case.of(module, data, options, steps)
     cameras = case.samples[0].cameras
     size = f"{len(cameras.names)} views x {cameras.width}x{cameras.height}, T={steps}"
     name = f"{case.samples[0].object_name}: {len(case.samples)} sequences x {size}"
     whole = medians({"": case.step}, options)[""]
     calls: dict[str, Callable[[], object]] = {"own": case.step, "plain": plain_forms()(case.step)}
     calls |= {form: plain_forms([form])(case.step) for form in OPERATIONS}
-    calls |= {setting: _Case.of(other, data, options, steps).step for setting, other in others.items()}
+    calls |= {setting: Case.of(other, data, options, steps).step for setting, other in others.items()}
     found = medians(calls, replace(options, rounds=min(SLOW_ROUNDS, options.rounds)))
     rows = [Row(name, "throughput", steps * len(case.samples) / whole, "sequence-steps/s")]
     rows.append(Row(name, "optimiser step", 1e3 * whole, "ms"))

@@ -99,7 +99,10 @@ class Plan(Options):
     fps: int = 24
     train_views: int = 4  # a held-out one is added
     stills: int = 24
-    resolution: int = option(96, "draw the videos in this size [pixels]", least=1)
+    resolution: tuple[int, ...] = option(
+        (96,), "draw the videos in this width and height, or so large a square [pixels]", least=1, nargs="+",
+        metavar=("WIDTH", "HEIGHT"),
+    )  # fmt: skip
     still_resolution: int = 192
     kernels: int = option(800, "give an object so many Gaussians, at least 50", least=50)
     swing: tuple[float, float] | None = option(
@@ -114,6 +117,8 @@ class Plan(Options):
         unknown = [name for name in self.objects if name not in RECIPES]
         if unknown or not self.objects:
             raise ConfigError(f"objects: no recipe for {unknown}; choose some of {', '.join(RECIPES)}.")
+        if len(self.resolution) not in (1, 2):
+            raise ConfigError(f"--resolution: expected WIDTH HEIGHT or one number, got {len(self.resolution)} numbers.")
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -122,6 +127,6 @@ class Plan(Options):
 
 
 QUICK = replace(
-    Plan(), objects=("pudding_soft", "flower_soft"), sequences=2, frames=20, stills=10, resolution=48,
+    Plan(), objects=("pudding_soft", "flower_soft"), sequences=2, frames=20, stills=10, resolution=(48,),
     still_resolution=64, kernels=150,
 )  # fmt: skip

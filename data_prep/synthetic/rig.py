@@ -22,9 +22,9 @@ VIDEO_ANGLES = ((-60.0, 18.0), (30.0, 18.0), (120.0, 18.0), (210.0, 40.0), (75.0
 
 
 def look_at(
-    azimuth: Array, elevation: Array, center: Array, radius: float, size: int, names: tuple[str, ...]
+    azimuth: Array, elevation: Array, center: Array, radius: float, size: tuple[int, ...], names: tuple[str, ...]
 ) -> Cameras:
-    """Cameras on a sphere [radian] that look at ``center`` with z up; the bounding sphere fills the image."""
+    """Cameras on a sphere [radian] that look at ``center`` with z up; the bounding sphere fills the shorter side."""
     distance = MARGIN * radius / math.sin(FIELD_OF_VIEW / 2)
     back = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
     right = np.stack((-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)), -1)
@@ -32,12 +32,14 @@ def look_at(
     viewmats = np.tile(np.eye(4), (len(azimuth), 1, 1))
     viewmats[:, :3, :3] = rotation
     viewmats[:, :3, 3] = -np.einsum("vij,vj->vi", rotation, center + distance * back)
-    focal = size / (2 * math.tan(FIELD_OF_VIEW / 2))
-    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras(torch.from_numpy(viewmats).float(), intrinsics.expand(len(azimuth), 3, 3).clone(), size, size, names)
+    width, height = size[0], size[-1]
+    focal = min(size) / (2 * math.tan(FIELD_OF_VIEW / 2))
+    intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    intrinsics = intrinsics.expand(len(azimuth), 3, 3).clone()
+    return Cameras(torch.from_numpy(viewmats).float(), intrinsics, width, height, names)
 
 
-def video_cameras(center: Array, radius: float, size: int, names: tuple[str, ...]) -> Cameras:
+def video_cameras(center: Array, radius: float, size: tuple[int, ...], names: tuple[str, ...]) -> Cameras:
     """The first ``len(names) - 1`` training cameras and the held-out one."""
     angles = np.radians([*VIDEO_ANGLES[: len(names) - 1], VIDEO_ANGLES[-1]])
     return look_at(angles[:, 0], angles[:, 1], center, radius, size, names)
@@ -46,7 +48,7 @@ def video_cameras(center: Array, radius: float, size: int, names: tuple[str, ...
 def still_cameras(center: Array, radius: float, size: int, count: int) -> Cameras:
     """Cameras spread evenly over the upper dome, from level to 70 degrees up."""
     azimuth, elevation = np.array(dome(count, 70.0)).T
-    return look_at(azimuth, elevation, center, radius, size, tuple(f"{i:04d}" for i in range(count)))
+    return look_at(azimuth, elevation, center, radius, (size,), tuple(f"{i:04d}" for i in range(count)))
 
 
 def photograph(

@@ -10,7 +10,7 @@ import torch
 from helpers import toy_object
 from helpers.simulators import gausim
 
-from benchmarks import cluster, data, interact, render, step, teach, train
+from benchmarks import cluster, data, interact, render, scale, step, teach, train
 from benchmarks.harness import Options, peak_saved_bytes
 from gausim.core import GaussianScene
 from gausim.data.datamodule import ReadyDataModule
@@ -61,6 +61,17 @@ def test_training_is_measured_and_leaves_the_weights(tmp_path: Path) -> None:
     assert {"throughput / model=other", "throughput / plain", "held for the backward pass, at most"} <= set(found)
     assert found["throughput"] == pytest.approx(6e3 / found["optimiser step"])
     assert all(torch.equal(before[name], value) for name, value in module.named_parameters())
+
+
+def test_the_whole_of_a_training_is_the_sum_of_its_stages(tmp_path: Path) -> None:
+    toy = toy_object.write_toy_object(tmp_path / "toy", frames=8)
+    plan = TrainingPlan(t_start=1, t_max=3, batch_size=2, epochs=2)
+    items = ReadyDataModule(toy.root, plan=plan)
+    rows = scale.measure(QUICK, _module([item.scene() for item in items.objects]), items, plan)
+    found = {row.metric: row for row in rows}
+    assert found["training"].case == "30 sequences, 2 epochs of 4 uses"
+    assert found["training"].value == pytest.approx(sum(found[stage].value for stage in ("tracking", "fit", "images")))
+    assert found["images"].value == pytest.approx(240 * found["optimiser step, per sequence"].value / 3600)
 
 
 def test_both_sides_of_a_renderers_ratio_compute_the_same() -> None:

@@ -13,10 +13,10 @@ from data_prep.synthesize import main
 from data_prep.synthetic.bodies import BODIES, Body
 from data_prep.synthetic.elastic import ElasticBody
 from data_prep.synthetic.embedding import cover_surface
-from data_prep.synthetic.plan import RECIPES, SMALL_SWING, Material
+from data_prep.synthetic.plan import RECIPES, SMALL_SWING, Material, Plan
 from data_prep.synthetic.pushes import push_field, pushed_motion, random_push
 from data_prep.synthetic.rig import still_cameras, video_cameras
-from gausim.core import DivergenceError
+from gausim.core import ConfigError, DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import composite
 from gausim.ops.visual_hull import project
@@ -94,6 +94,15 @@ def test_trilinear_points_follow_an_affine_motion_exactly(body: Body) -> None:
     assert (np.linalg.det(frames) > 0).all()
 
 
+def test_videos_are_as_wide_and_high_as_asked() -> None:
+    wide = video_cameras(np.zeros(3), 1.0, (96, 54), ("a", "b"))
+    pixel, _ = project(torch.zeros(1, 3), wide.viewmats, wide.Ks)
+    assert (wide.width, wide.height) == (96, 54) and torch.allclose(pixel, torch.tensor([48.0, 27.0]), atol=1e-4)
+    assert torch.allclose(wide.Ks[0, 0, 0], video_cameras(np.zeros(3), 1.0, (54,), ("a", "b")).Ks[0, 0, 0])
+    with pytest.raises(ConfigError, match="--resolution: expected WIDTH HEIGHT"):
+        Plan(resolution=(1, 2, 3))
+
+
 @pytest.mark.parametrize("name", PUSHED)
 def test_objects_stay_in_every_image_while_they_swing(name: str) -> None:
     body = BODIES[name]()
@@ -104,7 +113,7 @@ def test_objects_stay_in_every_image_while_they_swing(name: str) -> None:
     swing[[2, 5]] *= 0.3  # bodies are pushed sideways
     height = (body.nodes[:, 2] - low[2]) / (high[2] - low[2])
     moving = torch.from_numpy(body.nodes + height[:, None] * swing[:, None]).float().reshape(-1, 3)
-    video, still = video_cameras(center, radius, 96, names), still_cameras(center, radius, 96, 24)
+    video, still = video_cameras(center, radius, (96,), names), still_cameras(center, radius, 96, 24)
     for cameras, x in ((video, moving), (still, torch.from_numpy(body.nodes).float())):
         pixel, depth = project(x, cameras.viewmats, cameras.Ks)
         assert depth.min() > 0 and pixel.min() > 2 and pixel.max() < 94

@@ -141,7 +141,7 @@ def test_set_of_new_paths_is_the_same_object() -> None:
 @pytest.mark.parametrize("name", ["jelly_fall", "bar_hands", "bar_hands_new"])
 def test_every_sequence_stays_in_view_sound_and_above_the_floor(name: str) -> None:
     made = SyntheticObject(name, replace(QUICK, objects=(name,), frames=60))
-    cameras = video_cameras(np.asarray(made.room[0]), made.room[1], 96, made.plan.views)
+    cameras = video_cameras(np.asarray(made.room[0]), made.room[1], (96,), made.plan.views)
     for number in range(8):
         motion, _ = made._motion(number)
         points = torch.from_numpy(made.points.positions(motion)).float().reshape(-1, 3)
