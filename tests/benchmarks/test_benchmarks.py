@@ -1,16 +1,18 @@
 """Every case of the benchmarks at tiny sizes: figures exist, are finite, and ratios fit the times."""
 
+import json
 import math
 import subprocess
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from helpers import toy_object
 from helpers.simulators import gausim
 
-from benchmarks import cluster, data, interact, render, scale, step, teach, train
+from benchmarks import cluster, data, endurance, interact, render, scale, step, teach, train
 from benchmarks.harness import Options, peak_saved_bytes
 from gausim.core import GaussianScene
 from gausim.data.datamodule import ReadyDataModule
@@ -97,3 +99,12 @@ def test_teaching_is_measured_in_pairs() -> None:
     rows = {row.metric: row for row in teach.run(QUICK)}
     assert {(row.unit, row.value > 0) for row in rows.values()} == {("pairs/s", True), ("frames/s", True)}
     assert next(iter(rows.values())).case.startswith("teach, 120 kernels, ")
+
+
+def test_endurance_of_a_run(played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setattr(endurance, "load_run", lambda path, **_: played)
+    played.module.method = SimpleNamespace(hands=lambda sequence: None)
+    assert endurance.main([str(played.run_dir), "300"]) == 0
+    found = json.loads((played.run_dir / "evaluation" / "endurance.json").read_text())["toy"]
+    assert len(found["free"]["energy"]) == 15 and found["free"]["energy"][-1] < found["free"]["energy"][0]
+    assert max(found["pushed"]["away"][:12]) > 0 and "toy, pushed: highest energy" in capsys.readouterr().out

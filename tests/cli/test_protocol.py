@@ -20,7 +20,6 @@ from gausim.data import records
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData, reserved_part
 from gausim.doctor.examine import examine
-from gausim.metrics import image
 from gausim.results.looks import read_looks
 
 RESERVED = "data.test={sequences: [seq_001]}"
@@ -126,9 +125,6 @@ def test_looks_are_declared_counted_and_said(
     assert not (run / "evaluation" / "test.json").exists()
     with pytest.raises(ConfigError, match=r"--test: expected the number of trials.*--trials N.*trials=N"):
         evaluate.main([str(run), "--test"])
-    with monkeypatch.context() as patch, pytest.raises(ConfigError, match="pip install flip-evaluator"):
-        patch.setattr(image, "find_spec", lambda name: None)
-        evaluate.main([str(run), "--test", "--trials", "5", "--flip"])  # refused before the look is counted
     with pytest.raises(DataError, match=r"\['seq_001'\] belong to the test part, which is evaluated with --test"):
         evaluate.main([str(run), "--sequences", "seq_001"])
     with pytest.raises(DataError, match="belongs to the test part"):

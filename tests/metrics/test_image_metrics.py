@@ -3,11 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.waves import pair
 from scipy.ndimage import gaussian_filter
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from gausim.metrics import FLIP, L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric, mask_iou
+from gausim.metrics import L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric, mask_iou
 
 
 def images(seed: int = 0, count: int = 3, size: int = 24) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -95,11 +94,3 @@ def test_mask_iou_of_shifted_squares() -> None:
     found = mask_iou(prediction, target)
     assert found[:2].tolist() == pytest.approx([8 / 24, 0.0])
     assert math.isnan(found[2])
-
-
-def test_flip_measures_each_image_of_a_batch_by_itself() -> None:
-    pytest.importorskip("flip_evaluator", reason="flip-evaluator is not installed (extra 'flip')")
-    first, second = pair()
-    found = FLIP().per_image(torch.cat((first, second)), torch.cat((second, second)), torch.ones(2, 48, 64).bool())
-    # The first is what a second form of the method, written from the paper, gave for these pictures.
-    assert found.tolist() == pytest.approx([0.7077324390411377, 0.0], abs=2e-5)

@@ -20,7 +20,7 @@ from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
-from gausim.viewer.live import Companion, Live
+from gausim.viewer.live import Live
 from gausim.viewer.pointer import Pointer
 from gausim.viewer.shown import LIVE, Take
 from gausim.viewer.splats import SIZE, Placing
@@ -160,7 +160,7 @@ def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interactio
     assert interaction.tick == 0
 
 
-def test_a_companion_replays_with_the_gravity_and_the_gusts_of_the_session(make_interaction) -> None:
+def test_a_replay_has_the_gravity_and_the_gusts_of_the_session(make_interaction) -> None:
     recorded = Live(make_interaction(gravity=2.0), lambda _: None)
     recorded.interaction.seed = 3
     recorded.begin()
@@ -168,10 +168,8 @@ def test_a_companion_replays_with_the_gravity_and_the_gusts_of_the_session(make_
     recorded.act(Wind((0.0, 1.0, 0.0), 1.0, gusts=1.0))
     for _ in range(4):
         recorded.advance()
-    one = Live(make_interaction(), lambda _: None, companion=Companion("the same again", make_interaction()))
+    one = Live(make_interaction(), lambda _: None)
     one.replay(recorded.interaction.session())
     for _ in range(4):
         one.advance()
-    beside = one.shown().beside
     assert torch.equal(one.shown().frame.positions, recorded.interaction.frame.positions)
-    assert beside is not None and torch.equal(beside.frame.positions, recorded.interaction.frame.positions)

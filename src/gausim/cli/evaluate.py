@@ -6,14 +6,11 @@ import argparse
 from pathlib import Path
 
 from gausim.cli.arguments import add_data_option, add_device_options, add_names, command_parser, computing, positive
-from gausim.core.errors import ConfigError
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    if arguments.endurance is not None and arguments.endurance < 300:
-        raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
     from gausim.cli.evaluate_run import evaluate
 
     computing(arguments)
@@ -29,22 +26,12 @@ def _parser() -> argparse.ArgumentParser:
     add_names(parser, "objects", "measure these objects (default: all)")
     add_names(parser, "sequences", "measure these sequences of every object (default: all)")
     add("--cameras", default="all", choices=("all", "train", "heldout"), help="measure in these (default: all)")
-    add(
-        "--test",
-        action="store_true",
-        help="evaluate the test part; evaluation/test.json counts it",
-    )
+    add("--test", action="store_true", help="evaluate the test part; evaluation/test.json counts it")
     add("--trials", type=positive, metavar="N", help="declare N trials of the method on the development "
         "part, with --test (default: trials of the run)")  # fmt: skip
-    add("--flip", action="store_true", help="measure FLIP, too (extra `flip`), in as much time as all other metrics")
     add_data_option(parser)
     add("--out", metavar="DIR", type=Path, help="write to this folder (default: RUN/evaluation, of a part "
         "RUN/evaluation/partial)")  # fmt: skip
-    add(
-        "--endurance", type=int, metavar="N",
-        help="roll N frames far, too, free and under random pushes in the first 240, and write endurance.json and a "
-        "figure per object (at least 300, e.g. 1000; default: none)",
-    )  # fmt: skip
     add_device_options(parser)
     add("--verbose", action="store_true", help="print all tables, and list the files that are written")
     add("--json", action="store_true", help="print metrics.json and nothing else")

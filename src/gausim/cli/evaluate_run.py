@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,12 @@ from rich.markdown import Markdown
 from gausim.cli.output import end, named_bar
 from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
 from gausim.compose.data_paths import data_option
-from gausim.compose.predict import endurance, run_objects, state_of
+from gausim.compose.predict import run_objects, state_of
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
-from gausim.metrics import FLIP
-from gausim.pictures.figures import endurance_figure, error_figure
+from gausim.pictures.figures import error_figure
 from gausim.report.verdict import first_sentences
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
@@ -35,8 +33,6 @@ def evaluate(arguments: argparse.Namespace) -> int:
     """Measures a run by the options of the command; returns the exit status."""
     if is_pretrained(arguments.run):
         return _evaluate_bodies(arguments)
-    if arguments.flip:
-        FLIP()  # where it is not installed it is refused before a look is counted
     run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     facts = {**{key: run.config.get(key) for key in ("name", "seed")}, "views": arguments.cameras, **state_of(run)}
     part, sequences = _choose(run, arguments)
@@ -55,8 +51,6 @@ def evaluate(arguments: argparse.Namespace) -> int:
     for curves in results:
         error_figure(curves, folder / f"errors_{curves.name}.png")
         drawn += [f"film_{curves.name}.mp4", f"errors_{curves.name}.png"]
-    if arguments.endurance is not None:
-        drawn += _endure(run, arguments, folder)
     if arguments.json:
         print((folder / "metrics.json").read_text(), end="")
         return 0
@@ -73,10 +67,10 @@ def evaluate(arguments: argparse.Namespace) -> int:
 def _evaluate_bodies(arguments: argparse.Namespace) -> int:
     """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
     parts = arguments.objects or arguments.sequences or arguments.cameras != "all" or arguments.test
-    if parts or arguments.flip or arguments.endurance is not None:
+    if parts:
         raise ConfigError(
             f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --objects, "
-            "--sequences, --cameras, --test, --flip and --endurance."
+            "--sequences, --cameras and --test."
         )
     folder = arguments.out or arguments.run / "evaluation"
     module, data = load_corpus_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
@@ -114,24 +108,11 @@ def _evaluate(
                 run.renderer,
                 sequences=sequences[item.data.name],
                 views=_views(item.data, arguments.cameras),
-                flip=arguments.flip,
                 advance=advance,
                 films=folder,
             )
             for item in items
         ]
-
-
-def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
-    """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
-    found = {item.data.name: endurance(item, arguments.endurance) for item in run_objects(run, arguments.objects)}
-    (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
-    for name, rollouts in found.items():
-        endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
-        for kind, rollout in rollouts.items():
-            growth, late = rollout["growth"], rollout["late"]
-            print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
-    return ["endurance.json", *(f"endurance_{name}.png" for name in found)]
 
 
 def _views(data: ObjectData, group: str) -> list[str]:

@@ -18,13 +18,10 @@ from gausim.cli.arguments import (
     add_scene_options,
     command_parser,
     computing,
-    opened_scene,
-    pinned_by,
 )
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from gausim.cli.view_subject import Playable
     from gausim.viewer.subject import Subject
 
 
@@ -65,7 +62,6 @@ def _parser() -> argparse.ArgumentParser:
     add("what", metavar="RUN|SCENE.ply", type=Path, help="run directory of `gausim train`, or a 3DGS scene")
     add_names(parser, "objects", "show this object of the run (default: its first)", several=False)
     add_names(parser, "sequences", "begin where this sequence begins (default: at rest)", several=False)
-    add("--beside", metavar="RUN", type=Path, help="show another run of the same object, and do the same to both")
     add_data_option(parser)
     add("--gravity", type=float, metavar="G", help="set the weight of a mass [scene units / s^2] (default: 9.81)")
     add("--up", choices=UPS, default="z", help="point the scene's vertical axis so (write --up=-y; default: z)")
@@ -81,36 +77,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from gausim.cli.view_subject import Playable, subject_of
-    from gausim.io.ply import load_scene
+    from gausim.cli.view_subject import run_subject, scene_subject
 
-    is_run, beside = arguments.what.is_dir(), None
-    if arguments.beside is not None and not is_run:
-        raise ConfigError("--beside: expected a RUN before it, got a scene. Give two runs of one object.")
-    if is_run and (arguments.pin or arguments.base):
+    if not arguments.what.is_dir():
+        return scene_subject(arguments)
+    if arguments.pin or arguments.base:
         raise ConfigError("--pin and --from: expected with a scene only. A run has its pins and its network.")
-    if is_run:
-        made = _of_run(arguments.what, arguments, arguments.objects)
-    else:
-        bare = pinned_by(load_scene(arguments.what), arguments.pin)
-        made = Playable(opened_scene(bare, arguments, gravity=arguments.gravity))
-    if arguments.beside is not None:
-        beside = _of_run(arguments.beside, arguments, made.interaction.scene.name)
-    sessions = arguments.sessions or (arguments.what / "sessions" if is_run else Path("sessions"))
-    scene = made.interaction.scene
-    untrained = "untrained: template only" if arguments.base is None else f"network of {arguments.base}"
-    method = made.item.run.module.method_name if made.item is not None else untrained
-    title = f"{scene.name}: {scene.count} kernels, {method}"
-    return subject_of(made, title=title, beside=beside, up=arguments.up, sessions=sessions)
-
-
-def _of_run(path: Path, arguments: argparse.Namespace, name: str | None) -> Playable:
-    from gausim.cli.view_subject import playable_run
-    from gausim.compose.build import load_run
-    from gausim.compose.data_paths import data_option
-    from gausim.compose.live import REST
-    from gausim.compose.predict import state_of
-
-    run = load_run(path, data=data_option(arguments.data), device=arguments.device)
-    state_of(run)
-    return playable_run(run, name=name, sequence=arguments.sequences or REST, gravity=arguments.gravity)
+    return run_subject(arguments)

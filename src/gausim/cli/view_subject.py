@@ -2,58 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any
 
-from gausim.compose.build import LoadedRun
+from gausim.cli.arguments import opened_scene, pinned_by
+from gausim.compose.build import load_run
+from gausim.compose.data_paths import data_option
 from gausim.compose.live import REST, open_interaction
-from gausim.compose.predict import RunObject, run_object
-from gausim.core import Trajectory
-from gausim.interaction.interaction import Interaction
+from gausim.compose.predict import run_object, state_of
+from gausim.io.ply import load_scene
 from gausim.models.step.scene_model import SceneModel
-from gausim.models.template.template import Property
-from gausim.viewer.live import Companion
 from gausim.viewer.shown import Take
 from gausim.viewer.subject import Subject
 
 
-class Playable(NamedTuple):
-    """A method for one object."""
-
-    interaction: Interaction  # the interactive simulation of the object
-    item: RunObject | None = None  # the object of the run; None for a bare scene
-
-    def predictions(self) -> dict[str, Callable[[], Trajectory]]:
-        """Functions that predict the recorded sequences, by name."""
-        records = [] if self.item is None else self.item.data.sequences
-        return {record.name: partial(cast(RunObject, self.item), record) for record in records}
-
-
-def playable_run(
-    run: LoadedRun, *, name: str | None = None, sequence: str = REST, gravity: float | None = None, keep: int | None = 0
-) -> Playable:
-    """An object of a run, by default its first; the options are those of :func:`open_interaction`."""
-    interaction = open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep)
-    return Playable(interaction, run_object(run, name))
-
-
-def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
-    """The complete content of the viewer."""
-    cameras = companion = None
-    material: dict[str, Property] = {}
-    other = {} if beside is None else beside.predictions()
-    takes = [Take(f"Predicted: {name}", load, other.get(name)) for name, load in made.predictions().items()]
-    if made.item is not None:
-        run = made.item.run
-        cameras = made.item.data.sequences[0].cameras
-        if isinstance(run.module.model, SceneModel):
-            material = run.module.model.material(made.item.scene_id)
-    if beside is not None and beside.item is not None:
-        run = beside.item.run
-        companion = Companion(f"{run.module.method_name} ({Path(run.run_dir).name})", beside.interaction)
+def run_subject(arguments: argparse.Namespace) -> Subject:
+    """An object of a run, with the predictions of its recorded sequences."""
+    run = load_run(arguments.what, data=data_option(arguments.data), device=arguments.device)
+    state_of(run)
+    item = run_object(run, arguments.objects)
+    interaction = open_interaction(
+        run, name=arguments.objects, sequence=arguments.sequences or REST, gravity=arguments.gravity
+    )
+    model: Any = run.module.model
     return Subject(
-        title=title, interaction=made.interaction, takes=takes, companion=companion, cameras=cameras,
-        material=material, up=up, sessions=sessions,
-    )  # fmt: skip
+        title=f"{item.scene.name}: {item.scene.count} kernels, {run.module.method_name}",
+        interaction=interaction,
+        takes=[Take(f"Predicted: {record.name}", partial(item, record)) for record in item.data.sequences],
+        cameras=item.data.sequences[0].cameras,
+        material=model.material(item.scene_id) if isinstance(model, SceneModel) else {},
+        up=arguments.up,
+        sessions=arguments.sessions or arguments.what / "sessions",
+    )
+
+
+def scene_subject(arguments: argparse.Namespace) -> Subject:
+    """A scene without a run."""
+    scene = pinned_by(load_scene(arguments.what), arguments.pin)
+    method = "untrained: template only" if arguments.base is None else f"network of {arguments.base}"
+    return Subject(
+        title=f"{scene.name}: {scene.count} kernels, {method}",
+        interaction=opened_scene(scene, arguments, gravity=arguments.gravity),
+        up=arguments.up,
+        sessions=arguments.sessions or Path("sessions"),
+    )

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from torch import Tensor
 
 from gausim.compose.build import LoadedRun
-from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
+from gausim.core import GaussianScene, Trajectory
 from gausim.core.errors import DataError
 from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
-from gausim.evaluation.endurance import RandomPushes, endure
-from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.step.simulator import GausSim
 from gausim.runs.checkpoint import read_checkpoint
 from gausim.runs.directory import RunDirectory
-
-# Duration of the random pushes of `gausim evaluate --endurance` [frames].
-PUSHED_FRAMES = 240
 
 
 @dataclass(eq=False)
@@ -116,21 +110,3 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
         print(f"warning: {run.run_dir} is not finished; its latest checkpoint is used.", file=sys.stderr)
     known = read_checkpoint(directory.checkpoint)
     return {"finished": directory.is_finished, "epoch": known.get("epoch"), "updates": known.get("global_step")}
-
-
-def endurance(item: RunObject, frames: int) -> dict[str, Any]:
-    """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
-    run, module = item.run, cast(Any, item.run.module)
-    if not isinstance(module.model, GausSim):
-        raise ConfigError(
-            f"--endurance: {module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
-        )
-    scene, dynamics = item.scene.to(run.device), SceneDynamics(module.model, item.scene_id)
-    first, hands = module.initial_states.state(item.first_sequence).detach(), module.method.hands(item.first_sequence)
-    free = scene.simulated & ~scene.pinned
-    pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
-    still = SimState(scene.means, scene.means)
-    return {
-        "free": endure(dynamics, first, scene.means, scene.diagonal, frames, hands=hands),
-        "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
-    }

@@ -62,15 +62,10 @@ MASK_IOU = ImageMetricInfo(IOU, "mask IoU", 1.0, "", higher_is_better=True)
 PIXELS_AT_ONCE = 1 << 20
 
 
-def default_metrics(side: int = SMALLEST, *, flip: bool = False) -> list[metrics.ImageMetric]:
-    """The image metrics of tables for images of ``side`` pixels, with LPIPS where it is available.
-
-    Raises:
-        ConfigError: FLIP is wanted and not installed.
-    """
-    basic = (metrics.L2, metrics.ForegroundL2, metrics.PSNR, metrics.ForegroundPSNR, metrics.SSIM)
-    optional = [metrics.FLIP] * flip + [metrics.LPIPS] * (not absent_metrics(side))
-    return [kind() for kind in (*basic, *optional)]
+def default_metrics(side: int = SMALLEST) -> list[metrics.ImageMetric]:
+    """The image metrics of tables for images of ``side`` pixels, with LPIPS where it is available."""
+    found = [metrics.L2(), metrics.ForegroundL2(), metrics.PSNR(), metrics.ForegroundPSNR(), metrics.SSIM()]
+    return found if absent_metrics(side) else [*found, metrics.LPIPS()]
 
 
 def absent_metrics(side: int) -> dict[str, str]:
@@ -109,18 +104,16 @@ def evaluate_object(
     *,
     sequences: Sequence[str] | None = None,
     views: Sequence[str] | None = None,
-    flip: bool = False,
     advance: Callable[[str], None] | None = None,
     films: Path | None = None,
 ) -> ObjectCurves:
     """Per-frame figures of every method (a prediction by its row) and reference on every sequence of an object.
 
-    The rest scene has all kernels of the trajectories. Sequences and views are all, unless named; ``flip`` measures
-    FLIP, too, in as much time as everything else. ``advance`` is called with a sequence's name when it is done.
-    ``films`` is a folder for ``film_OBJECT.mp4`` of the first method on the first sequence.
+    The rest scene has all kernels of the trajectories. Sequences and views are all, unless named;
+    ``advance`` is called with a sequence's name when it is done. ``films`` is a folder for ``film_OBJECT.mp4`` of the
+    first method on the first sequence.
 
     Raises:
-        ConfigError: FLIP is wanted and not installed.
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
@@ -130,7 +123,7 @@ def evaluate_object(
     chosen = data.views if views is None else views
     train, heldout = ([v for v in chosen if (v in data.train_views) == is_train] for is_train in (True, False))
     task = _Task(
-        data, scene, methods, renderer, train + heldout, default_metrics(side, flip=flip), reference,
+        data, scene, methods, renderer, train + heldout, default_metrics(side), reference,
         SceneAppearance.of(scene, scene.foreground), None if points is None else attach_points(scene, points),
         _linear_references(data) if reference.name == STATIC else {},
         None if films is None else Film(data, records[0].name, train + heldout),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from importlib.util import find_spec
 from typing import ClassVar
 
 import kornia.metrics
@@ -11,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
-
-from gausim.core import ConfigError
 
 # Limits the PSNR of identical images to 100 dB, which otherwise would be infinite.
 SMALLEST_MSE = 1e-10
@@ -119,27 +116,3 @@ class SSIM(ImageMetric):
         """SSIM of the whole image, kornia's implementation."""
         first, second = (images.permute(0, 3, 1, 2) for images in (prediction, target))
         return kornia.metrics.ssim(first, second, WINDOW).mean((1, 2, 3))
-
-
-class FLIP(ImageMetric):
-    """Mean over pixels of the perceived difference of two images shown alternately (Andersson et al. 2020), 0 to 1.
-
-    By its authors' package, on the CPU, in the paper's viewing condition (67 pixels per degree).
-
-    Raises:
-        ConfigError: the package is not installed.
-    """
-
-    key, label, scale, unit = "flip", "FLIP", 1e2, "1e-2"
-
-    def __init__(self) -> None:
-        super().__init__()
-        if find_spec("flip_evaluator") is None:
-            raise ConfigError("FLIP is not installed. `pip install flip-evaluator`.")
-
-    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
-        """Mean over the whole image."""
-        from flip_evaluator import evaluate
-
-        pairs = zip(*(images.detach().float().cpu().numpy() for images in (target, prediction)), strict=True)
-        return torch.tensor([evaluate(*pair, "LDR", applyMagma=False)[1] for pair in pairs]).to(target)

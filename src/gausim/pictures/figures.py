@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -95,22 +94,6 @@ def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path
     for axes, image, label in zip(places, images, labels, strict=False):  # the last row may be incomplete
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
-    save_figure(figure, path)
-
-
-def endurance_figure(name: str, rollouts: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """Motion energy and distance from rest over the frames of every rollout of ``endurance.json``.
-
-    A rollout has ``window`` [frames], and ``energy`` and ``away`` per window.
-    """
-    figure, (left, right) = made_figure(1, 2, (9.6, 3.4), f"{name}, far beyond the recording")
-    for color, (kind, told) in zip(METHOD_COLORS, rollouts.items(), strict=False):
-        frames = (np.arange(len(told["energy"])) + 0.5) * told["window"]
-        left.semilogy(frames, np.maximum(told["energy"], 1e-30), color=color, label=kind)
-        right.plot(frames, 100 * np.asarray(told["away"]), color=color, label=kind)
-    left.set(title="motion energy", xlabel="frame")
-    right.set(title="mean distance from rest [% of diagonal]", xlabel="frame", ylim=(0, None))
-    right.legend(fontsize=8)
     save_figure(figure, path)
 
 

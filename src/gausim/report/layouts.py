@@ -22,7 +22,7 @@ SPREAD = "± deviation over seeds; in brackets, deviation over sequences (root m
 ERROR_RATIO = ERROR_3D + RATIO
 # The paper's splits; `unseen_all` exists for recordings beyond frame 49.
 SPLITS = ("seen", "unseen", "unseen_all")
-_IMAGES = ("l2", "ssim", "lpips", "psnr", "flip", IOU)
+_IMAGES = ("l2", "ssim", "lpips", "psnr", IOU)
 # Metric and views of the tables whose columns are objects, the paper's three first.
 _METRICS = (
     *((metric, "train") for metric in _IMAGES),

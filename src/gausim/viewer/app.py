@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from gausim.viewer.pipeline import Rate, Worker
 from gausim.viewer.pointer import Pointer
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.shown import Shown
-from gausim.viewer.splats import SIZE, Placing, add_splats, pack
+from gausim.viewer.splats import Placing, add_splats, pack
 from gausim.viewer.subject import Subject
 
 # Update rate of view-dependent colours while time is stopped [1 / s].
@@ -31,7 +30,7 @@ _VIEWS = 10.0
 class _Painted:
     shown: Shown
     legend: Legend
-    buffers: list[UInt32[np.ndarray, "_ 8"]]  # of the object, and of that of the second method
+    buffer: UInt32[np.ndarray, "_ 8"]
 
 
 class Viewer:
@@ -54,36 +53,21 @@ class Viewer:
         scene = subject.interaction.scene
         self.server = GuardedServer(access, label="gausim")
         self.placing = Placing.of(scene)
-        painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
-        self._looks = [(painter, self.placing)]  # of the object, and of that of the second method
+        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
         self.workers = (Worker("paint", self._paint), Worker("send", self._send))
         self.live = Live(
-            subject.interaction, self.workers[0].put, takes=subject.takes, companion=subject.companion,
+            subject.interaction, self.workers[0].put, takes=subject.takes,
             watched=lambda: bool(self.server.get_clients()),
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
         self.server.scene.world_axes.visible = False
         self.pointer = Pointer(self.server, self.live, self.placing)
-        self.page = Page(self.server, self.live, self.pointer, subject, painter, self.repaint)
+        self.page = Page(self.server, self.live, self.pointer, subject, self._painter, self.repaint)
         self.camera_panel = CameraPanel(self.server, self.placing, subject)
         self.eye = torch.tensor(self.camera_panel.first_position, dtype=torch.float32)
         self._viewed, self._sent = 0.0, Rate()
-        self._place_beside(subject)
-        first = self._paint_now(self.live.shown())
-        names = ("/splats", "/beside")
-        self._splats = [add_splats(self.server.scene, *shown) for shown in zip(names, first.buffers, strict=False)]
+        self._splats = add_splats(self.server.scene, "/splats", self._paint_now(self.live.shown()).buffer)
         self.server.on_client_connect(self._connected)
-
-    def _place_beside(self, subject: Subject) -> None:
-        if subject.companion is None:
-            return
-        other, offset = subject.companion.interaction, self.camera_panel.aside
-        x, y, z = map(float, offset)
-        placing = Placing(self.placing.centre, self.placing.scale, (x, y, z))
-        self._looks.append((Painter(other.scene, other.units, other.masses), placing))
-        top = float((placing.to_page(other.scene.means.float()).numpy() @ self.camera_panel.up).max())
-        above = offset + (top + 0.06 * SIZE) * self.camera_panel.up
-        self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
 
     @property
     def url(self) -> str:
@@ -126,29 +110,18 @@ class Viewer:
 
     @torch.no_grad()
     def _paint_now(self, shown: Shown) -> _Painted:
-        legends, buffers = [], []
-        for frame, (painter, placing) in zip((shown, shown.beside), self._looks, strict=False):
-            if frame is None:
-                continue
-            mode = self.page.mode if self.page.mode in painter.modes else VIEW
-            eye = placing.to_scene(self.eye)
-            covars, rgb, legend = painter(frame.frame, frame.unit_of_kernel, frame.speed, mode, eye)
-            if frame is shown:
-                held = torch.zeros_like(self.pointer.mask) if shown.held is None else shown.held.cpu()
-                rgb = highlighted(rgb, self.pointer.mask, held)
-            legends.append(legend)
-            buffers.append(pack(frame.frame.positions.cpu(), covars, rgb, painter.opacities, placing))
-        return _Painted(shown, legends[0], buffers)
+        painter, frame, eye = self._painter, shown.frame, self.placing.to_scene(self.eye)
+        covars, rgb, legend = painter(frame, shown.unit_of_kernel, shown.speed, self.page.mode, eye)
+        held = torch.zeros_like(self.pointer.mask) if shown.held is None else shown.held.cpu()
+        rgb = highlighted(rgb, self.pointer.mask, held)
+        return _Painted(shown, legend, pack(frame.positions.cpu(), covars, rgb, painter.opacities, self.placing))
 
     def _paint(self, shown: Shown) -> None:
         self.workers[1].put(self._paint_now(shown))
 
     def _send(self, painted: _Painted) -> None:
         with self.server.atomic():
-            for splats, buffer in zip_longest(self._splats, painted.buffers):
-                splats.visible = buffer is not None
-                if buffer is not None:
-                    splats.buffer = buffer
+            self._splats.buffer = painted.buffer
             self.pointer.follow(painted.shown)
         self._sent.count()
         paused = not self.live.playing  # this frame must be displayed, as no other may follow

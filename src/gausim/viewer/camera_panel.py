@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 _FREE = "Free"
 # Vertical field of view without cameras [rad].
 _HEIGHT_OF_VIEW = 0.8
-# Distance of two objects side by side, in widths of the object.
-_APART = 1.25
 
 
 class CameraPanel:
@@ -26,34 +24,18 @@ class CameraPanel:
 
     Attributes:
         up: vertical direction.
-        forward: direction of the initial view.
         first_position: camera position of the initial view [page units].
-        aside: offset of a companion from the object [page units]; zero without one.
     """
 
     def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
         self._server, self._placing, self._cameras = server, placing, subject.cameras
         self.up = np.array(parse_direction(subject.up))
         self.first_position, target, fov = self._first()
-        self.forward = (target - self.first_position) / np.linalg.norm(target - self.first_position)
-        self.aside = np.zeros(3)
-        if subject.companion is not None:
-            self.aside = self._aside(subject)
-            target = target + self.aside / 2
-            self.first_position = target - self.forward * (1.8 * np.linalg.norm(self.first_position - target))
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = self.first_position, target, self.up
         camera.fov = fov
         if self._cameras is not None:
             self._add_cameras(self._cameras)
-
-    def _aside(self, subject: Subject) -> np.ndarray:
-        """Offset to the right of the initial view by slightly more than the object's width."""
-        right = np.cross(self.forward, self.up)
-        right /= max(float(np.linalg.norm(right)), 1e-9)
-        scene = subject.interaction.scene
-        across = self._placing.to_page(scene.means[scene.foreground].float().cpu()).double().numpy() @ right
-        return np.asarray(right * max(_APART * float(np.ptp(across)), 0.3 * SIZE))
 
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position, target and vertical field of view of the initial view."""

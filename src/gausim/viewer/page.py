@@ -279,9 +279,8 @@ class Page:
         live = self._live
         simulated = live.rate.per_second if shown.source == LIVE and live.playing else 0.0
         state = "playing" if live.playing else "paused"
-        beside = live.companion.message if live.companion is not None else ""
         limit = _AT_LIMIT if shown.source == LIVE and live.interaction.resisting else ""
-        problems = [text for text in (live.message, beside, limit) if text]
+        problems = [text for text in (live.message, limit) if text]
         acting = ", ".join(live.interaction.acting) if shown.source == LIVE else ""
         warnings = "".join(
             f"<div style='margin-top:.3em;padding:.3em;background:#fff3cd;color:#664d03;border-radius:3px'>"

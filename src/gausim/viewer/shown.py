@@ -27,13 +27,12 @@ class Shown:
     number: int = 0  # index of the frame on the timeline
     last: int = 0  # last index of the timeline
     source: str = LIVE  # :data:`LIVE` or the name of a take
-    beside: Shown | None = None  # the frame of the second method, or None
 
     @staticmethod
-    def of(now: Interaction, beside: Shown | None = None) -> Shown:
+    def of(now: Interaction) -> Shown:
         """The latest frame of an interaction."""
         speed = (now.state.positions - now.state.previous).norm(dim=-1) * now.fps
-        return Shown(now.frame, now.unit_of_kernel, speed, beside=beside)
+        return Shown(now.frame, now.unit_of_kernel, speed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +41,9 @@ class Take:
 
     name: str  # name on the page
     load: Callable[[], Trajectory]  # computes the trajectory, called at its first use
-    # computes the second method's prediction of the same sequence, or None
-    beside: Callable[[], Trajectory] | None = None
 
 
-def shown_frame(trajectory: Trajectory, number: int, name: str, beside: Shown | None = None) -> Shown:
+def shown_frame(trajectory: Trajectory, number: int, name: str) -> Shown:
     """A frame of a recording for display.
 
     Raises:
@@ -58,4 +55,4 @@ def shown_frame(trajectory: Trajectory, number: int, name: str, beside: Shown | 
     if not bool(torch.isfinite(frame.positions).all()):
         raise DivergenceError(f"{name}: frame {number} is not finite.")
     speed = (frame.positions - trajectory.positions[max(0, number - 1)]).norm(dim=-1) * trajectory.fps
-    return Shown(frame, trajectory.unit_of_kernel, speed, None, number, trajectory.frames - 1, name, beside)
+    return Shown(frame, trajectory.unit_of_kernel, speed, None, number, trajectory.frames - 1, name)

@@ -23,12 +23,10 @@ _LARGEST = 6e4
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Map from the scene to the page: (x - centre) * scale + offset."""
+    """Map from the scene to the page: (x - centre) * scale."""
 
     centre: Float[Tensor, " 3"]  # centre of the simulated kernels' bounding box at rest [scene units]
     scale: float  # page units per scene unit
-    # displacement of a scene shown beside another one [page units]
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @staticmethod
     def of(scene: GaussianScene) -> Placing:
@@ -38,11 +36,11 @@ class Placing:
 
     def to_page(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Maps points from the scene to the page."""
-        return (points.cpu() - self.centre.to(points.dtype)) * self.scale + points.new_tensor(self.offset).cpu()
+        return (points.cpu() - self.centre.to(points.dtype)) * self.scale
 
     def to_scene(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Maps points from the page to the scene."""
-        return (points - points.new_tensor(self.offset)) / self.scale + self.centre.to(points.dtype)
+        return points / self.scale + self.centre.to(points.dtype)
 
 
 def pack(

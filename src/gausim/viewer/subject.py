@@ -9,7 +9,6 @@ from pathlib import Path
 from gausim.core import Cameras
 from gausim.interaction.interaction import Interaction
 from gausim.models.template.template import Property
-from gausim.viewer.live import Companion
 from gausim.viewer.shown import Take
 
 
@@ -20,7 +19,6 @@ class Subject:
     title: str  # heading of the page, one line
     interaction: Interaction  # the simulation
     takes: Sequence[Take] = ()  # recordings that can be played
-    companion: Companion | None = None  # a second method shown beside the first, or None
     cameras: Cameras | None = None  # cameras of the data set, or None
     material: Mapping[str, Property] = field(default_factory=dict)  # learned properties of the kernels by name
     up: str = "z"  # vertical axis: x, y, z, -x, -y or -z

@@ -1,23 +1,36 @@
-"""Long rollouts of a simulator far beyond its training frames: free motion, and motion under random pushes."""
+"""Long rollouts of a trained simulator: ``python -m benchmarks.endurance RUN [FRAMES]``.
+
+Writes ``RUN/evaluation/endurance.json``: energy and distance from rest of every object's first sequence without forces,
+and under random pushes in the first 240 frames.
+"""
 
 from __future__ import annotations
 
+import json
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gausim.core import Hands, SimState
+from gausim.compose.build import load_run
+from gausim.compose.predict import RunObject, run_objects
+from gausim.core import ConfigError, Hands, SimState
 from gausim.metrics.motion import motion_energy
 from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
 
 # Frames over which a figure is averaged.
 WINDOW = 20
 # A push: frames from start to start, its length in frames, its radius and its shift per frame [diagonals].
 PUSH_EVERY, PUSH_FRAMES, PUSH_REACH, PUSH_SHIFT = 24, 3, 0.15, 0.002
+# Duration of the random pushes [frames].
+PUSHED_FRAMES = 240
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,3 +98,38 @@ def endure(
 def _windows(values: np.ndarray) -> np.ndarray:
     count = len(values) // WINDOW
     return values[: count * WINDOW].reshape(count, WINDOW).mean(1)
+
+
+def endurance(item: RunObject, frames: int) -> dict[str, Any]:
+    """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
+    run, module = item.run, cast(Any, item.run.module)
+    if not isinstance(module.model, GausSim):
+        raise ConfigError(f"{run.run_dir}: {module.method_name} takes no forces. Take a run of a simulator.")
+    scene, dynamics = item.scene.to(run.device), SceneDynamics(module.model, item.scene_id)
+    first, hands = module.initial_states.state(item.first_sequence).detach(), module.method.hands(item.first_sequence)
+    free = scene.simulated & ~scene.pinned
+    pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
+    still = SimState(scene.means, scene.means)
+    return {
+        "free": endure(dynamics, first, scene.means, scene.diagonal, frames, hands=hands),
+        "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
+    }
+
+
+@torch.no_grad()
+def main(argv: Sequence[str]) -> int:
+    """Measures, prints and writes the rollouts of a run."""
+    run, frames = load_run(argv[0], device="auto"), max(300, int(argv[1]) if len(argv) > 1 else 1000)
+    found = {item.data.name: endurance(item, frames) for item in run_objects(run)}
+    path = Path(argv[0]) / "evaluation" / "endurance.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(found, indent=1) + "\n")
+    for name, rollouts in found.items():
+        for kind, rollout in rollouts.items():
+            growth, late = rollout["growth"], rollout["late"]
+            print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
