@@ -1,8 +1,8 @@
 """Make a corpus of random elastic bodies with known motion and material, to learn elasticity from.
 
-Shapes (blobs, stems, slabs, shells, forks, lattices, rings, figures and any mesh), materials, pins, pushes and frame
-rates are random; MuJoCo's finite elements move the bodies, and the material point method a fraction of them. There are
-no pictures. Every body follows from the seed and its number alone; what was interrupted goes on body by body.
+Shapes (blobs, stems, slabs, shells, forks, lattices, rings and figures), materials, pins, pushes and frame rates are
+random; MuJoCo's finite elements move the bodies. There are no pictures. Every body follows from the seed and its
+number alone; what was interrupted goes on body by body.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 import msgspec
 from safetensors.numpy import load_file, save
 
-from data_prep.blender.meshes import read_mesh
 from data_prep.common.command import add_options, chosen, cores, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, each, silent
 from data_prep.common.stage import Stage, run_stage
@@ -28,19 +27,14 @@ from gausim.io.files import write_durably, write_json
 
 # Raise when the same settings give another corpus than before.
 REVISION = 1
-PACKAGES = ("mujoco", "warp-lang", "numpy", "scipy")
+PACKAGES = ("mujoco", "numpy", "scipy")
 SHARD, PIECES = 32, "pieces"  # bodies of a shard; folder of those that are in none yet
 
 
 def make_corpus(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Makes a corpus."""
-    settings = {**asdict(plan), "meshes": [path.name for path in plan.meshes]}
-    if len(set(settings["meshes"])) < len(plan.meshes):
-        raise ConfigError(f"--meshes: two files have one name: {', '.join(settings['meshes'])}.")
-    meshes = {f"mesh_{path.name}": path for path in plan.meshes}
-    for path in plan.meshes:
-        read_mesh(path)  # raises before a body is made
-    stage = Stage("corpus", REVISION, meshes, settings, PACKAGES)
+    settings = asdict(plan)
+    stage = Stage("corpus", REVISION, {}, settings, PACKAGES)
     return run_stage(stage, out, lambda work: _make(work, plan, settings, workers, tick), overwrite=overwrite)
 
 
@@ -85,7 +79,6 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = stage_parser("corpus", __doc__)
     parser.add_argument("--workers", type=int, default=cores(), help="use so many processes (%(default)s)")
-    parser.add_argument("--sheet", action="store_true", help="draw a contact sheet of the corpus, OUT/sheet.png")
     add_options(parser, Plan)
     return run_command(parser, argv, _run)
 
@@ -94,19 +87,9 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     plan = chosen(Plan, arguments)
     if importlib.util.find_spec("mujoco") is None:
         raise ConfigError("MuJoCo moves these bodies. Install it with `pip install 'gausim[synth]'`.")
-    if plan.second and importlib.util.find_spec("warp") is None:
-        raise ConfigError(
-            f"The material point method, which moves a fraction of {plan.second:g}, needs Warp. Install it with "
-            "`pip install 'gausim[baselines]'`, or give --second 0."
-        )
     manifest = make_corpus(
         arguments.out, plan, workers=max(1, arguments.workers), overwrite=arguments.overwrite, tick=tick
     )
-    if arguments.sheet:
-        from data_prep.random_bodies.sheet import write_sheet
-        from gausim.data.corpus import Corpus
-
-        write_sheet(Corpus(arguments.out), arguments.out / "sheet.png")
     told = manifest["results"]
     return (
         f"{headline(arguments.out, manifest)}: {told['bodies']} bodies, {told['sequences']} sequences; "

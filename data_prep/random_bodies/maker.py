@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,23 +10,19 @@ from scipy.spatial import cKDTree
 from data_prep.common.spread import farthest
 from data_prep.random_bodies.lattice import PINS, body_of, pinned, warped
 from data_prep.random_bodies.matter import Matter, Modes, modes_of, random_drag, random_matter
-from data_prep.random_bodies.motion import FiniteElements, MaterialPoints, Simulator, push_velocity, random_push
+from data_prep.random_bodies.motion import FiniteElements, push_velocity, random_push
 from data_prep.random_bodies.plan import CELLS, DIAGONALS, KEPT_SWING, LEAST_VOLUME, PERIODS, RATES, Plan
-from data_prep.random_bodies.shapes import SHAPES, Rng, from_mesh
+from data_prep.random_bodies.shapes import SHAPES, Rng
 from data_prep.synthetic.bodies import Array, Body
 from data_prep.synthetic.embedding import CANDIDATES, Embedding, cover_surface
 from gausim.core import DivergenceError
 from gausim.data.corpus import BodyRecord, PushRecord
 
 MODES = 32
-# Costs that are not paid: element steps per frame by finite elements (of bodies of CELLS; as fast ones of more cells
-# take more), point steps by material points.
-MOST_COST, MOST_POINT_COST = 3e5, 1.2e5
+# Element steps per frame that are not paid, of bodies of CELLS; as fast ones of more cells take more.
+MOST_COST = 3e5
 PUSH_TRIALS, WEAKER, STRONGER = 4, 0.6, 2.0
 BODY_TRIALS, KIND_TRIALS = 60, 6  # draws of a body, and those of one kind of shape and pins
-# Swing that measures the period of the material points [diagonals]; the most that it may differ from the elements',
-# so that the grid is fine enough for the body and its modulus means the same.
-TRIAL_SWING, MOST_SLOWER = 0.02, 1.4
 
 
 class Rejected(Exception):
@@ -46,7 +40,7 @@ class Subject:
     modes: Modes
     fps: float
     period: float  # of the slowest mode [frames]
-    simulator: Simulator
+    simulator: FiniteElements
 
 
 def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
@@ -55,17 +49,14 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
     Raises:
         DivergenceError: none of many draws gave motion worth keeping, which no plan within its limits brings about.
     """
-    shapes: list[str | Path] = [*plan.shapes, *plan.meshes]
-    # Bodies of the second simulator are spread evenly over the corpus.
-    second = int((number + 1) * plan.second) > int(number * plan.second)
     redrawn = 0
     for trial in range(BODY_TRIALS):
         # Shape and pins stay for some trials, or those that are dear to simulate would be rare.
         kinds = np.random.default_rng([plan.seed, number, 1, trial // KIND_TRIALS])
-        shape, pins = shapes[int(kinds.integers(len(shapes)))], str(kinds.choice(PINS))
+        shape, pins = plan.shapes[int(kinds.integers(len(plan.shapes)))], str(kinds.choice(PINS))
         rng = np.random.default_rng([plan.seed, number, 2, trial])
         try:
-            subject = _draw(plan, shape, pins, rng, second=second)
+            subject = _draw(plan, shape, pins, rng)
             positions, pushes, failed = _sequences(plan, subject, rng)
         except (Rejected, DivergenceError):
             redrawn += 1
@@ -74,17 +65,15 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
     raise DivergenceError(f"body {number}: {BODY_TRIALS} draws gave no motion worth keeping. Choose another --swing.")
 
 
-def _draw(plan: Plan, kind: str | Path, pins: str, rng: Rng, *, second: bool) -> Subject:
-    """A body of a kind of shape, or of a mesh, at rest."""
-    field = SHAPES[kind](rng) if isinstance(kind, str) else from_mesh(kind)
-    shape = kind if isinstance(kind, str) else kind.name
-    body = body_of(field, int(rng.integers(*plan.cells)))
+def _draw(plan: Plan, shape: str, pins: str, rng: Rng) -> Subject:
+    """A body of a kind of shape at rest."""
+    body = body_of(SHAPES[shape](rng), int(rng.integers(*plan.cells)))
     held = body and pinned(warped(body, float(np.exp(rng.uniform(*np.log(DIAGONALS)))), rng), pins, rng)
     if held is None:
         raise Rejected
     fps = float(rng.choice(RATES))
     period = float(np.exp(rng.uniform(*np.log(PERIODS))))
-    relative = random_matter(held, rng, kinds=plan.materials, even_drag=second)
+    relative = random_matter(held, rng, kinds=plan.materials)
     if relative.kind not in plan.materials:
         raise Rejected
     modes = modes_of(held, relative, MODES)
@@ -96,26 +85,8 @@ def _draw(plan: Plan, kind: str | Path, pins: str, rng: Rng, *, second: bool) ->
     if modes.highest / fps * 6 * len(held.cells) > MOST_COST * finer:
         raise Rejected
     points = _kernels(held, int(rng.integers(plan.kernels[0], plan.kernels[1] + 1)), rng)
-    simulator: Simulator
-    if second:
-        simulator, matter = _material_points(points, matter, modes, fps, period)
-    else:
-        simulator = FiniteElements(points, matter, modes, fps=fps)
+    simulator = FiniteElements(points, matter, modes, fps=fps)
     return Subject(shape, pins, points, matter, modes, fps, period, simulator)
-
-
-def _material_points(
-    points: Embedding, matter: Matter, modes: Modes, fps: float, period: float
-) -> tuple[MaterialPoints, Matter]:
-    """Material points whose own slowest period is as asked for: grid and elements differ in stiffness."""
-    mover = MaterialPoints(points, matter, fps=fps)
-    if mover.cost() > MOST_POINT_COST:
-        raise Rejected
-    slower = mover.period_of(modes.shapes[0], period / fps, TRIAL_SWING * points.body.diagonal) * fps / period
-    if not 1 / MOST_SLOWER < slower < MOST_SLOWER:
-        raise Rejected
-    matter = replace(matter, young_modulus=matter.young_modulus * slower**2)
-    return MaterialPoints(points, matter, fps=fps), matter
 
 
 def _kernels(body: Body, count: int, rng: Rng) -> Embedding:
@@ -183,10 +154,9 @@ def _result(
         "damping": matter.drag[cell].astype(np.float32),
         "displacement": ((positions - rest) / body.diagonal).astype(np.float16),
     }
-    kind = re.sub("[^A-Za-z0-9]+", "_", Path(subject.shape).stem)[:40].strip("_") or "mesh"
     record = BodyRecord(
-        name=f"{kind}_{number:06d}", shard="", shape=subject.shape, pins=subject.pins, material=matter.kind,
-        contrast=matter.contrast, simulator=subject.simulator.name, kernels=len(rest), sequences=len(positions),
+        name=f"{subject.shape}_{number:06d}", shard="", shape=subject.shape, pins=subject.pins, material=matter.kind,
+        contrast=matter.contrast, kernels=len(rest), sequences=len(positions),
         frames=plan.frames, fps=subject.fps, diagonal=body.diagonal, poisson_ratio=matter.poisson_ratio,
         period=subject.period, swing=max(push.swing for push in pushes), pushes=tuple(pushes), redrawn=redrawn,
     )  # fmt: skip

@@ -47,7 +47,7 @@ class Modes:
     highest: float  # angular frequency of the fastest mode of all [1/s]
 
 
-def random_matter(body: Body, rng: Rng, *, kinds: Sequence[str], even_drag: bool) -> Matter:
+def random_matter(body: Body, rng: Rng, *, kinds: Sequence[str]) -> Matter:
     """Material whose stiffness and drag are relative, their means 1; even where two halves come out as one."""
     kind = str(rng.choice(kinds))
     middle = body.nodes[body.cells].mean(1)
@@ -64,7 +64,7 @@ def random_matter(body: Body, rng: Rng, *, kinds: Sequence[str], even_drag: bool
     if np.ptp(level) == 0:
         kind = "even"
     contrast = float(np.exp(rng.uniform(*np.log(CONTRASTS))))
-    density, drag = rng.uniform(-1, 1) * np.log(3), 0.0 if even_drag else rng.uniform(-1, 1) * np.log(4)
+    density, drag = rng.uniform(-1, 1) * np.log(3), rng.uniform(-1, 1) * np.log(4)
     if kind == "halves":
         density = drag = 0.0
     young = contrast**level

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from data_prep.common.command import Options, option
 
@@ -53,12 +52,4 @@ class Plan(Options):
         (0.02, 0.3), "push by amplitudes from LOW to HIGH [fractions of the body's diagonal] (0.02 0.3)",
         least=1e-3, most=0.4, interval=True,
     )  # fmt: skip
-    second: float = option(0.2, "move this fraction of bodies by the material point method (0.2)", least=0, most=1)
-    meshes: tuple[Path, ...] = option(
-        (),
-        "draw from these surfaces (OBJ or PLY), too, each as likely as a kind of shape",
-        nargs="+",
-        metavar="FILE",
-        type=Path,
-    )
     seed: int = option(0, "draw everything random with this seed (0)", least=0)

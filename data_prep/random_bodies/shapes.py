@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
-from data_prep.blender.meshes import read_mesh
 from data_prep.synthetic.bodies import Array
 
 Rng = np.random.Generator
 Field = Callable[[Array], Array]  # (P, 3) -> (P,)
-DIPOLES, SAMPLES = 3000, 32  # of a mesh's surface; along an edge of the grid that its field is interpolated on
 
 
 def blob(rng: Rng) -> Field:
@@ -138,32 +133,6 @@ def figure(rng: Rng) -> Field:
         if ears < 0.5:
             parts.append(_tube(np.stack((shoulder, shoulder + [side * 0.5, rng.uniform(-0.3, 0.3), -0.1])), 0.13, 0.11))
     return _union(parts)
-
-
-@cache
-def from_mesh(path: Path) -> Field:
-    """The inside of a surface: its winding number, by dipoles spread over it (Barill et al. 2018), above a half."""
-    mesh = read_mesh(path)
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    corners = (((mesh.vertices - (low + high) / 2) / (0.5 * (high - low).max())) * 0.95)[mesh.triangles]
-    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area, rng = np.linalg.norm(normal, axis=1), np.random.default_rng(0)
-    pick = rng.choice(len(area), size=DIPOLES, p=area / area.sum())
-    place = np.einsum("pc,pcx->px", rng.dirichlet(np.ones(3), DIPOLES), corners[pick])
-    strength = normal[pick] / area[pick, None] * area.sum() / (4 * np.pi * DIPOLES)
-    volume = float(np.einsum("tx,tx->", corners.mean(1), normal))
-    blur = np.sqrt(area.sum() / DIPOLES)
-
-    axis = np.linspace(-1.1, 1.1, SAMPLES)
-    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    winding = np.empty(len(places))
-    for start in range(0, len(places), 512):
-        p = places[start : start + 512]
-        square = (p**2).sum(1)[:, None] + (place**2).sum(1) + 0.25 * blur**2 - 2 * p @ place.T
-        flux = (place * strength).sum(1) - p @ strength.T
-        winding[start : start + 512] = (flux / (square * np.sqrt(square))).sum(1)
-    inside = (np.sign(volume) * winding - 0.5).reshape((SAMPLES,) * 3)
-    return RegularGridInterpolator((axis, axis, axis), inside, bounds_error=False, fill_value=-0.5)
 
 
 SHAPES: dict[str, Callable[[Rng], Field]] = {

@@ -54,7 +54,7 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         ],
         "synthesize": "--quick --objects pudding_soft --sequences 1 --frames 16 --resolution 24 --kernels 60 "
         "--workers 1".split(),
-        "corpus": "--bodies 2 --sequences 1 --frames 4 --kernels 60 60 --second 0 --workers 1".split(),
+        "corpus": "--bodies 2 --sequences 1 --frames 4 --kernels 60 60 --workers 1".split(),
     }  # fmt: skip
 
     class Made(dict):

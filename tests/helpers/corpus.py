@@ -34,7 +34,7 @@ def write_corpus(folder: Path, bodies: int = 3) -> Path:
         push = PushRecord("poke", "release", (1.0, 0.0, 0.0), float(moved.norm(dim=-1).max()) / diagonal)
         records.append(
             BodyRecord(
-                name, shard, "slab", "bottom", "split", 2.0, "none", len(rest), SEQUENCES, FRAMES,
+                name, shard, "slab", "bottom", "split", 2.0, len(rest), SEQUENCES, FRAMES,
                 FPS, diagonal, 0.3, period, push.swing, (push,) * SEQUENCES, 0,
             )
         )  # fmt: skip

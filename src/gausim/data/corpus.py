@@ -47,11 +47,10 @@ class BodyRecord(Struct, frozen=True, forbid_unknown_fields=True):
 
     name: _Name  # prefix of its tensors
     shard: _Name  # file that holds it
-    shape: str  # kind of its shape, such as ``fork``, or the mesh's file name
+    shape: str  # kind of its shape, such as ``fork``
     pins: str  # kind of its pins
     material: str  # ``even``, ``split`` or ``halves`` (two materials), or ``smooth``
     contrast: _Size  # largest stiffness over the smallest
-    simulator: str  # that moved it
     kernels: _Count
     sequences: _Count
     frames: _Count
