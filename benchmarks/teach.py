@@ -28,7 +28,7 @@ def run(options: Options) -> list[Row]:
     for number in range(TOGETHER):
         swing = torch.sin(0.4 * torch.arange(FRAMES))[:, None] * torch.randn(motions.count, generator=draws) / 8
         shown.append(Track(0, number, motions.displacements(swing * motions.sizes).to(options.device)))
-    lesson = Lesson(learner, model, shown, Teaching().noise, seed=0)
+    lesson = Lesson(learner, model, shown, Teaching(), seed=0)
     count, groups = UPDATES[options.quick], learner.groups()
     pairs: list[Start] = [(number, number) for number in range(TOGETHER)]
     rollouts: list[Start] = [(number, 0) for number in range(TOGETHER)]

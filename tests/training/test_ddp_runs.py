@@ -56,6 +56,16 @@ def test_two_ranks_learn_what_one_does(trainings: Trainings) -> None:
 
 
 @pytest.mark.slow
+def test_two_ranks_begin_with_what_the_first_one_was_taught(trainings: Trainings) -> None:
+    settings = ("model=gausim_network", "plan.teach.shows=2", "plan.teach.rolls=2", "plan.epochs=1")
+    for name, own in (("both_taught", TWO), ("alone_taught", ("trainer=cpu", "plan.batch_size=2"))):
+        status, output = trainings(name, *settings, *own)
+        assert status == 0 and [output.count(f"  {stage}: ") for stage in ("track", "teach", "roll")] == [1] * 3, output
+    found, alone = (rows(trainings.run(name) / "epochs.csv") for name in ("both_taught", "alone_taught"))
+    assert len(found) == 1 and float(found[0]["loss_image"]) == pytest.approx(float(alone[0]["loss_image"]), rel=2e-3)
+
+
+@pytest.mark.slow
 def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(trainings: Trainings) -> None:
     settings, name = (*TWO, "plan.epochs=2"), "swept"
     status, output = trainings(name, *settings, "optimizer.network_lr=0.001,0.002", "-m")

@@ -40,7 +40,7 @@ def test_a_network_that_is_taught_an_oscillator_has_learned_its_flow(toy: Path) 
 
     def left() -> float:
         """Squared error of single steps from true unseen states."""
-        lesson = Lesson(module, module.model, whole, 0.0, seed=0)
+        lesson = Lesson(module, module.model, whole, Teaching(), seed=0)
         with torch.no_grad():
             return float(lesson.errors([(i, t) for i in (0, 1) for t in range(17, 27)], 1)[0])
 
@@ -86,11 +86,13 @@ def test_the_plan_leaves_teaching_out_where_motion_cannot_be_tracked() -> None:
     for wrong in ({"shows": -1}, {"shows": 0, "rolls": 0}, {"noise": -1.0}):
         with pytest.raises(ConfigError, match=r"plan\.teach: expected shows and rolls"):
             Teaching(**wrong)
+    with pytest.raises(ConfigError, match=r"plan\.teach\.sums: expected 0 to 1"):
+        Teaching(sums=1.5)
 
 
 def test_kernels_move_by_the_noise_of_their_unit_and_every_pair_is_shown_once(toy: Path) -> None:
     module, data = build(compose([f"data.root={toy}", *QUICK, "supervision=points"]))
-    lesson = Lesson(module, module.model, track(module, data, quiet=True), 0.1, seed=0)
+    lesson = Lesson(module, module.model, track(module, data, quiet=True), Teaching(sums=1.0), seed=0)
     pairs = [start for starts in lesson.pairs() for start in starts]
     assert sorted(pairs) == [(i, t) for i in range(2) for t in range(15)]
     batch = module.model.batch([0, 0])
@@ -104,3 +106,23 @@ def test_kernels_move_by_the_noise_of_their_unit_and_every_pair_is_shown_once(to
     expected = data.index.ground_truth(1).positions
     assert torch.equal(state.positions[: len(rest)], rest)
     assert float((state.positions[len(rest) :] - rest).norm()) > 0 and expected.shape[0] == 28
+
+
+def test_lessons_on_sums_are_motions_about_rest_that_begin_with_their_states(toy: Path) -> None:
+    module, data = build(compose([f"data.root={toy}", *QUICK, "supervision=points"]))
+    tracks = track(module, data, quiet=True)
+    lesson = Lesson(module, module.model, tracks, Teaching(sums=1.0), seed=0)
+    batch, starts = module.model.batch([0, 0]), [(0, 4), (1, 7)]
+    plain, true = lesson._motion(batch, starts, 3, trained=False)
+    state, summed = lesson._sums(batch, starts, 3, plain, true, trained=False)
+    assert torch.equal(state.positions, summed[0]) and summed.shape == true.shape == (4, len(batch.rest), 3)
+    assert not torch.allclose(summed, true)
+    span = torch.stack(
+        [tracks[0].moved[t : t + 4] for t in range(13)] + [tracks[1].moved[t : t + 4] for t in range(13)]
+    )
+    parts = (summed - batch.rest).unflatten(1, (2, -1))[:, 0].flatten()  # in the span of tracked motions of this length
+    span = span.flatten(1).mT.double()
+    left = span @ torch.linalg.lstsq(span, parts.double()[:, None]).solution - parts.double()[:, None]
+    assert float(left.norm()) < 1e-3 * float(parts.norm())
+    unchanged = Lesson(module, module.model, tracks, Teaching(sums=0.0), seed=0)
+    assert torch.equal(unchanged._sums(batch, starts, 3, plain, true, trained=False)[1], true)

@@ -61,6 +61,7 @@ class Teaching:
     Attributes:
         shows: shows of each sequence in single steps.
         rolls: shows of each sequence in rollouts, T growing from 2 to all seen frames.
+        sums: fraction of the lessons that are on sums of two motions of a body, of random sizes.
         noise: deviation of the noise of every unit in single steps, of its velocity half as much per frame [diagonals].
         roll_factor: factor on the learning rates in the rollouts.
         rate_factor: factor on all learning rates in the training that follows.
@@ -68,6 +69,7 @@ class Teaching:
 
     shows: int = 60
     rolls: int = 60
+    sums: float = 0.5
     noise: float = 1e-3
     roll_factor: ClassVar[float] = 0.2
     rate_factor: ClassVar[float] = 0.2
@@ -78,6 +80,8 @@ class Teaching:
                 "plan.teach: expected shows and rolls of at least 0, one of them more, and noise >= 0, got "
                 f"{self.shows}, {self.rolls} and {self.noise}. Without teaching it is null."
             )
+        if not 0 <= self.sums <= 1:
+            raise ConfigError(f"plan.teach.sums: expected 0 to 1, got {self.sums}.")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,10 @@ is a true one, too, it learns the flow itself,
 
 over pairs of tracked frames in random order. The noise e, d of every unit stands for the errors of a rollout. Rollouts
 of T frames on the tracks follow, T growing, half of them from frame 0, through which loss gradients flow as a whole.
+
+Motions of a few frames say little of smaller ones: a network that they alone have taught need not come to rest. Small
+motions of an elastic body add up, so a part of the lessons is on sums of two displacements from rest, a u_i + b u_j, of
+the same body, with (a, b) anywhere in the unit disc.
 """
 
 from __future__ import annotations
@@ -48,9 +52,11 @@ Start = tuple[int, int]
 class Lesson:
     """Rollouts from tracked states, compared with the tracks."""
 
-    def __init__(self, learner: Learner, model: GausSim, tracks: Sequence[Track], noise: float, seed: int) -> None:
-        """Stores the tracked positions; ``noise`` is that of :class:`Teaching`."""
-        self._learner, self._model, self._noise = learner, model, noise
+    def __init__(
+        self, learner: Learner, model: GausSim, tracks: Sequence[Track], settings: Teaching, seed: int
+    ) -> None:
+        """Stores the tracked positions."""
+        self._learner, self._model, self._settings = learner, model, settings
         self._scenes = [known.scene_id for known in tracks]
         self._numbers = [known.sequence_id for known in tracks]
         self._positions = [model.scenes[known.scene_id].means.to(known.moved) + known.moved for known in tracks]
@@ -92,20 +98,50 @@ class Lesson:
         return SimState(known[0], known[1], tuple(known[2:])).remembering(self._model.history)
 
     def errors(
-        self, starts: Sequence[Start], steps: int, *, noisy: bool = False, trained: bool = False
+        self, starts: Sequence[Start], steps: int, *, noisy: bool = False, trained: bool = False, summed: bool = False
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Mean squared distance of rollouts from the tracks, and that of their beginnings [% of the diagonal]^2."""
         batch = self._model.batch([self._scenes[i] for i, _ in starts])
-        state = self.state(batch, starts, trained=trained)
-        true = torch.cat([self._positions[i][t : t + steps + 1] for i, t in starts], 1).to(batch.rest)
+        state, true = self._motion(batch, starts, steps, trained=trained)
+        if summed:
+            state, true = self._sums(batch, starts, steps, state, true, trained=trained)
         if noisy:
-            shift, change = self._drawn(batch, self._noise), self._drawn(batch, self._noise / 2)
+            noise = self._settings.noise
+            shift, change = self._drawn(batch, noise), self._drawn(batch, noise / 2)
             older = tuple(x + shift for x in state.older)
             state = SimState(state.positions + shift, state.previous + shift + change, older)
         ((_, made),) = windows(self._learner.simulator, cast(Any, batch), state, steps, steps)
         positions, weight = States.of(made).positions, _weights(batch)
         wrong, moved = positions - true[1:], true[1:] - (true[:1] if steps == 1 else batch.rest)
         return (weight * wrong.square()).sum() / steps, (weight * moved.square()).sum() / steps
+
+    def _motion(
+        self, batch: SceneBatch, starts: Sequence[Start], steps: int, *, trained: bool
+    ) -> tuple[SimState, Float[Tensor, "F K 3"]]:
+        """Tracked states, and the positions from there on."""
+        true = torch.cat([self._positions[i][t : t + steps + 1] for i, t in starts], 1)
+        return self.state(batch, starts, trained=trained), true.to(batch.rest)
+
+    def _sums(
+        self, batch: SceneBatch, starts: Sequence[Start], steps: int, state: SimState, true: Tensor, *, trained: bool
+    ) -> tuple[SimState, Float[Tensor, "F K 3"]]:
+        """Some of the motions replaced by sums with others of the same body, all others as they are."""
+        own = [[j for j, scene in enumerate(self._scenes) if scene == self._scenes[i]] for i, _ in starts]
+        draws = torch.rand(5, len(starts), generator=self.draws)
+        places = [(numbers[int(x * len(numbers))], int(y * (self.last - steps + 1))) for numbers, x, y in
+                  zip(own, draws[0].tolist(), draws[1].tolist(), strict=True)]  # fmt: skip
+        other, also = self._motion(batch, places, steps, trained=trained)
+        size, angle, chosen = draws[2].sqrt(), 2 * math.pi * draws[3], draws[4] < self._settings.sums
+        factors = torch.stack((torch.where(chosen, size * angle.cos(), 1.0), chosen * size * angle.sin()))
+        counts = torch.tensor([member.kernels.stop - member.kernels.start for member in batch.members])
+        a, b = factors.repeat_interleave(counts, 1)[:, :, None].to(batch.rest)
+
+        def add(x: Tensor, y: Tensor) -> Tensor:
+            return batch.rest + a * (x - batch.rest) + b * (y - batch.rest)
+
+        older = tuple(add(x, y) for x, y in zip(state.older, other.older, strict=True))
+        begun = SimState(add(state.positions, other.positions), add(state.previous, other.previous), older)
+        return begun, add(true, also)
 
     def _drawn(self, batch: SceneBatch, size: float) -> Float[Tensor, "K 3"]:
         """Noise of every unit, in its kernels; none where a kernel is pinned."""
@@ -130,12 +166,12 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
         learner: the method; its optimiser's settings apply.
         model: its simulator.
         tracks: from :func:`gausim.training.tracking.track`.
-        settings: length and noise.
+        settings: length, sums and noise.
         seed: of the order and the noise.
         quiet: show no progress bar.
         fitted: whether densities, attributes and template are fitted; single steps then train the network alone.
     """
-    lesson, normalisers = Lesson(learner, model, tracks, settings.noise, seed), normalisers_of(model)
+    lesson, normalisers = Lesson(learner, model, tracks, settings, seed), normalisers_of(model)
     model.train()
     with torch.no_grad():
         for starts in lesson.pairs():
@@ -191,7 +227,7 @@ def descend(
         factor = rate * falling.factor(done, 1.0) * min(1.0, (number + 1) / WARMUP)
         set_rates(optimizer, lambda name, factor=factor: factor)  # type: ignore[misc]
         optimizer.zero_grad(set_to_none=True)
-        loss, motion = lesson.errors(starts, steps, noisy=steps == 1, trained=steps > 1)
+        loss, motion = lesson.errors(starts, steps, noisy=steps == 1, trained=steps > 1, summed=True)
         if not bool(torch.isfinite(loss)):
             continue
         loss.backward()
