@@ -110,6 +110,8 @@ def test_a_ceiling_bounds_what_forces_do() -> None:
     assert max(_energies(model, free)) > 20 * ceiling
     found = _energies(model, bound)
     assert max(found) <= ceiling * (1 + 1e-4) and max(found) > 0.2 * ceiling
+    ends = [float(model.energy(model.batch((0,)), SimState(x, x)).detach()) for x in bound]
+    assert max(ends) <= 2 * ceiling * (1 + 1e-4)
     pinned = scene.pinned | ~scene.simulated
     assert torch.equal(bound[:, pinned], scene.means[pinned].expand(81, -1, -1))
     assert torch.equal(pushed(1e9), free)

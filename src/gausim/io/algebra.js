@@ -14,15 +14,24 @@ function times(a, x, rows, out = new Float64Array(rows)) {
   return out;
 }
 
-// out = A^T x for a matrix with as many rows as x has entries.
+// out = A^T x for a matrix with as many rows as x has entries, a multiple of three.
 function timesTransposed(a, x, columns, out = new Float64Array(columns)) {
   out.fill(0);
-  for (let i = 0, at = 0; i < x.length; i++) {
-    const value = x[i];
-    if (value === 0) { at += columns; continue; }
-    for (let j = 0; j < columns; j++) out[j] += a[at++] * value;
+  for (let i = 0; i < x.length; i += 3) {
+    const u = x[i], v = x[i + 1], w = x[i + 2];
+    let at = i * columns, second = at + columns, third = second + columns;
+    for (let j = 0; j < columns; j++) out[j] += u * a[at++] + v * a[second++] + w * a[third++];
   }
   return out;
+}
+
+// out (M, M) += A^T B of three rows of both, which begin at `from` and `start`.
+function addProduct(out, a, from, b, m, start = 0) {
+  for (let i = 0, at = 0; i < m; i++) {
+    const u = a[from + i], v = a[from + m + i], w = a[from + 2 * m + i];
+    let first = start, second = start + m, third = start + 2 * m;
+    for (let j = 0; j < m; j++) out[at++] += u * b[first++] + v * b[second++] + w * b[third++];
+  }
 }
 
 // The factors of a square matrix, with partial pivoting, by which `solve` divides.
@@ -71,13 +80,6 @@ function inverse(matrix, size) {
     const column = solve(factors, one);
     for (let i = 0; i < size; i++) out[i * size + j] = column[i];
   }
-  return out;
-}
-
-// Entry by entry.
-function product(a, b) {
-  const out = new Float64Array(a.length);
-  for (let i = 0; i < a.length; i++) out[i] = a[i] * b[i];
   return out;
 }
 

@@ -1,8 +1,10 @@
 // A learned body: modal coordinates z of two frames, their step, and the units that follow from them.
 
-// Fractions of a force that are tried in turn where the whole of it would exceed the ceiling of the energy.
-const WEAKER = [0.5, 0.25, 0.125, 0.0625, 0];
-const BISECTIONS = 10, CORRECTIONS = { solid: 4, springs: 3 };
+// Fractions of a force that are tried in turn, until the energy stays below its ceiling.
+const PARTS = [1, 0.5, 0.25, 0.125, 0.0625, 0];
+const BISECTIONS = 10;
+// Corrections of a step: the most, the last one's size over the motion, how much smaller than the one before each is.
+const CORRECTIONS = 12, ACCURACY = 1e-4, SLOW = 0.5;
 const MIN_DETERMINANT = 0.2; // units that are flatter than this are drawn undeformed
 const LEAST_LEFT = 0.1; // least part of an impulse that damping leaves in its first frame
 
@@ -10,16 +12,14 @@ class Body {
   constructor(arrays, facts) {
     const { modes, units, diagonal } = facts;
     Object.assign(this, { arrays, facts, modes, units });
-    const solid = "quadratic" in arrays;
-    this.law = solid ? new Solid(arrays, facts) : new Springs(arrays, facts);
-    this.corrections = CORRECTIONS[solid ? "solid" : "springs"];
+    this.law = "cells" in arrays ? new Solid(arrays, facts) : new Springs(arrays, facts);
     this.gradients = arrays.gradients.map((value) => value / diagonal);
     this.unitOf = arrays.unit_of_kernel;
     this.rest();
     this.adjust(1, 1);
   }
 
-  rest() { this.z = new Float64Array(this.modes); this.before = new Float64Array(this.modes); this.limited = 0; }
+  rest() { this.z = new Float64Array(this.modes); this.before = new Float64Array(this.modes); this.limited = this.weaker = 0; }
 
   // Begins at rest with the velocity of a recorded sequence.
   begin(start) { this.rest(); this.before = Float64Array.from(start.before); }
@@ -39,6 +39,7 @@ class Body {
     }
     const whole = mixed(this.inertia, this.stiffness, 1 / 4);
     this.linear = mixed(whole, this.damping, 1 / 2);
+    this.factors = null;
     // An impulse begins with as much velocity as its frame reaches (overshoot in gausim/models/template/modal.py).
     const slow = inverse(this.stiffness, m), lost = dotOf(slow, this.damping) / (2 * dotOf(slow, whole));
     const reach = inverse(whole, m), left = Math.max(LEAST_LEFT, 1 - lost);
@@ -67,30 +68,36 @@ class Body {
     return out;
   }
 
-  // z at t + 1: a step of the trapezoidal rule, as in gausim/models/template/modal.py. `held` are displacements to be
-  // reached exactly, { rows (R, M), to (R,) }; they act by forces like those of hands.
+  // z at t + 1: a step of the trapezoidal rule, as in gausim/models/template/modal.py. Its corrections divide by factors of
+  // an earlier step, which are computed anew where corrections do not become smaller fast. `held` are displacements to
+  // be reached exactly, { rows (R, M), to (R,) }; they act by forces like those of hands.
   after(z, before, held) {
-    const { law, modes: m } = this, speed = mixed(z, before, -1);
+    const { law, modes: m } = this, speed = mixed(z, before, -1), onward = mixed(z, speed, 1);
     const force = mixed(times(this.stiffness, z, m), times(this.damping, speed, m), 1).map((value) => -value);
-    const first = law.state(weighted(z, 0.5, before, 0.5)), now = law.state(z), onward = mixed(z, speed, 1);
-    let bend = new Float64Array(m), factors, grip;
-    for (let correction = 0; correction < this.corrections; correction++) {
+    const first = law.state(weighted(z, 0.5, before, 0.5));
+    let bend = new Float64Array(m), size = Infinity, grip = held && this.factors && this.grip(held);
+    for (let correction = 0; correction < CORRECTIONS; correction++) {
       const second = law.state(mixed(z, mixed(speed, bend, 1), 0.5));
-      if (correction < this.corrections - 1) {
-        const stiffening = correction ? law.stiffening(first, second) : law.stiffening(now, now);
-        factors = factorised(mixed(this.linear, stiffening, 1 / 4), m);
-        grip = held && this.grip(factors, held);
+      if (!this.factors) {
+        this.factors = factorised(mixed(this.linear, law.stiffening(first, second), 1 / 4), m);
+        grip = held && this.grip(held);
       }
-      const force_now = mixed(force, law.between(first, second), 1);
-      bend = mixed(bend, solve(factors, mixed(force_now, times(this.linear, bend, m), -1)), 1);
-      if (grip) bend = grip(bend, onward);
+      const missing = mixed(mixed(force, law.between(first, second), 1), times(this.linear, bend, m), -1);
+      const next = mixed(bend, solve(this.factors, missing), 1);
+      const change = mixed(grip ? grip(next, onward) : next, bend, -1);
+      bend = mixed(bend, change, 1);
+      const now = Math.sqrt(dotOf(change, change)), whole = Math.sqrt(dotOf(speed, speed) + dotOf(bend, bend));
+      if (now <= ACCURACY * whole) break;
+      if (!(now <= SLOW * size)) this.factors = null;
+      if (!Number.isFinite(now)) break;
+      size = now;
     }
     return mixed(onward, bend, 1);
   }
 
   // Moves `bend` to where what is held is held, by forces on it.
-  grip(factors, { rows, to }) {
-    const m = this.modes, count = to.length, answers = [], gram = new Float64Array(count * count);
+  grip({ rows, to }) {
+    const { factors, modes: m } = this, count = to.length, answers = [], gram = new Float64Array(count * count);
     for (let r = 0; r < count; r++) answers.push(solve(factors, rows.subarray(r * m, (r + 1) * m)));
     for (let r = 0; r < count; r++) for (let s = 0; s < count; s++) {
       gram[r * count + s] = dotOf(rows.subarray(r * m, (r + 1) * m), answers[s]);
@@ -111,33 +118,37 @@ class Body {
     return (kinetic + quadraticForm(this.stiffness, middle)) / 2 + this.law.potential(this.law.state(middle));
   }
 
+  // Whether a step to z is below the ceiling: in motion, and below twice the ceiling at rest at its end, where fast modes
+  // have more potential energy than in the middle. `standing` is the energy of standing still; what is above is allowed.
+  isBelow(z, standing = 0) {
+    const { ceiling } = this;
+    return this.energy(z, this.z) <= Math.max(ceiling, standing) && this.energy(z, z) <= Math.max(2 * ceiling, standing);
+  }
+
   // One frame under a change of z per frame (push) and with displacements that are held. Where they would let the energy
   // exceed the ceiling, the force, or the way of what is held, is reduced; at last the step is cut short
-  // (energy_guard.py). Without them a step adds no energy.
+  // (energy_guard.py). The fractions begin one above that of the last frame.
   step(push = null, held = null) {
-    const tried = (scale) => {
-      const from = push && scale ? mixed(this.before, this.pushed(push), -scale) : this.before;
-      return this.after(this.z, from, held && { rows: held.rows, to: mixed(held.from, mixed(held.to, held.from, -1), scale) });
+    const tried = (part) => {
+      const from = push && part ? mixed(this.before, this.pushed(push), -part) : this.before;
+      return this.after(this.z, from, held && { rows: held.rows, to: mixed(held.from, mixed(held.to, held.from, -1), part) });
     };
-    let z = tried(1), energy = push || held ? this.energy(z, this.z) : 0;
-    if (!(energy <= this.ceiling)) {
-      this.limited++;
-      for (const scale of WEAKER) {
-        z = tried(scale); energy = this.energy(z, this.z);
-        if (energy <= this.ceiling) break;
-      }
-      if (!(energy <= this.ceiling)) z = this.cutShort(z);
-    }
-    this.before = this.z; this.z = z;
+    const last = push || held ? PARTS.length - 1 : 0;
+    let weaker = Math.min(last, Math.max(0, this.weaker - 1)), z = tried(PARTS[weaker]);
+    let below = this.isBelow(z);
+    while (!below && weaker < last) below = this.isBelow((z = tried(PARTS[++weaker])));
+    if (!below) z = this.cutShort(z);
+    if (!below || weaker) this.limited++;
+    Object.assign(this, { before: this.z, z, weaker });
   }
 
   // The longest fraction of a step below the ceiling, by bisection.
   cutShort(z) {
-    const limit = Math.max(this.ceiling, this.energy(this.z, this.z)), way = mixed(z, this.z, -1);
+    const standing = this.energy(this.z, this.z), way = mixed(z, this.z, -1);
     let low = 0, high = 1;
     for (let i = 0; i < BISECTIONS; i++) {
-      const scale = (low + high) / 2, part = mixed(this.z, way, scale);
-      if (Math.max(this.energy(part, this.z), this.energy(part, part)) <= limit) low = scale; else high = scale;
+      const part = (low + high) / 2;
+      if (this.isBelow(mixed(this.z, way, part), standing)) low = part; else high = part;
     }
     return mixed(this.z, way, low);
   }

@@ -5,146 +5,150 @@
 //   potential(state)              the potential energy
 // `scale` is on its stiffness, `growth` the resistance to the growth of strain or length [frames].
 
-// Finite strain as a polynomial (gausim/models/template/reduced.py): y = (z, z_i z_j and z_i^2 / 2), energy y^T G y / 2.
+// Units of which the stiffening of a solid is computed; more are merged, as corrections need not divide by the exact one.
+const COARSE = 128;
+
+// Points (N, 3) in groups of neighbours: the largest is split at the median of its longest side.
+function split(points, count, most) {
+  const groups = [Array.from({ length: count }, (_, n) => n)];
+  while (groups.length < most) {
+    const group = groups.sort((a, b) => a.length - b.length).pop();
+    const sides = [0, 1, 2].map((c) => Math.max(...group.map((n) => points[3 * n + c])) - Math.min(...group.map((n) => points[3 * n + c])));
+    const axis = sides.indexOf(Math.max(...sides)), half = group.length >> 1;
+    group.sort((a, b) => points[3 * a + axis] - points[3 * b + axis]);
+    groups.push(group.slice(0, half), group.slice(half));
+  }
+  return groups;
+}
+
+// Green's strain of the cells near the units with Hooke's law (gausim/models/template/finite_strain.py).
 class Solid {
-  constructor({ linear, mixed: cross, quadratic, pair_scales, cells, moduli }, { modes, diagonal }) {
-    const pairs = pair_scales.length;
-    Object.assign(this, { linear, cross, modes, pairs, moduli, scale: 1, growth: 0, units: moduli.length / 2 });
-    this.table = new Int16Array(pairs * pairs); // G's block of pairs over the products of their scales: half the memory
-    this.scales = Float64Array.from(pair_scales);
-    for (let i = 0, at = 0; i < pairs; i++) for (let j = 0; j <= i; j++, at++) {
-      this.table[i * pairs + j] = this.table[j * pairs + i] = quadratic[at];
-    }
-    this.cells = cells.map((value) => value / diagonal); // displacement gradients of the modes (N, 9, M)
-    this.squares = new Float32Array(this.units * pairs); // of each unit sum_ij H_ij H_ij^T, lower triangles
-    for (let n = 0, at = 0; n < this.units; n++) for (let i = 0; i < modes; i++) for (let j = 0; j <= i; j++, at++) {
-      let sum = 0;
-      for (let c = 9 * n; c < 9 * n + 9; c++) sum += this.cells[c * modes + i] * this.cells[c * modes + j];
-      this.squares[at] = sum;
-    }
+  constructor({ cells, moduli, centres }, { modes }) {
+    Object.assign(this, { cells, moduli, modes, scale: 1, growth: 0, units: moduli.length / 2 });
+    Object.assign(this, { stress: new Float64Array(9 * this.units), turned: new Float64Array(9 * modes) });
+    this.coarse = this.units > COARSE ? this.merged(split(centres, this.units, COARSE)) : this;
   }
 
+  // The body with groups of units in place of units: their mean gradients, weighted by their moduli.
+  merged(groups) {
+    const size = 9 * this.modes, cells = new Float32Array(groups.length * size), moduli = new Float32Array(2 * groups.length);
+    groups.forEach((group, at) => {
+      for (const n of group) for (let c = 0; c < 2; c++) moduli[2 * at + c] += this.moduli[2 * n + c];
+      for (const n of group) {
+        const share = this.moduli[2 * n] / moduli[2 * at];
+        for (let c = 0; c < size; c++) cells[at * size + c] += share * this.cells[n * size + c];
+      }
+    });
+    return new Solid({ cells, moduli }, this);
+  }
+
+  // Displacement gradients h (N, 9), row by row, and strains e (N, 6): xx, yy, zz, yz, xz, xy.
   state(z) {
-    const pair = new Float64Array(this.pairs);
-    for (let i = 0, at = 0; i < this.modes; i++) {
-      for (let j = 0; j < i; j++) pair[at++] = z[i] * z[j];
-      pair[at++] = z[i] * z[i] / 2;
+    const h = times(this.cells, z, 9 * this.units), e = new Float64Array(6 * this.units);
+    for (let n = 0, o = 0, at = 0; n < this.units; n++, o += 9, at += 6) {
+      const a = h[o], b = h[o + 1], c = h[o + 2], d = h[o + 3], f = h[o + 4], g = h[o + 5], p = h[o + 6], q = h[o + 7], r = h[o + 8];
+      e[at] = a + (a * a + d * d + p * p) / 2;
+      e[at + 1] = f + (b * b + f * f + q * q) / 2;
+      e[at + 2] = r + (c * c + g * g + r * r) / 2;
+      e[at + 3] = (g + q + b * c + f * g + q * r) / 2;
+      e[at + 4] = (c + p + a * c + d * g + p * r) / 2;
+      e[at + 5] = (b + d + a * b + d * f + p * q) / 2;
     }
-    return { z, pair };
+    return { z, h, e };
   }
 
-  // G's block of pairs times the state's; kept, as several forces ask for it.
-  pulled(state) {
-    return (state.pulled ??= product(this.scales, times(this.table, product(this.scales, state.pair), this.pairs)));
-  }
-
-  // Weights of the first and the second state in the mean strain, resistance to growth included.
-  get parts() { return [0.5 - this.growth, 0.5 + this.growth]; }
-
-  // Stress of the mean strain with e_ij, a symmetric matrix as a lower triangle.
-  tension(first, second) {
-    const [a, b] = this.parts, one = this.pulled(first), two = this.pulled(second);
-    const out = timesTransposed(this.cross, weighted(first.z, a, second.z, b), this.pairs);
-    for (let p = 0; p < this.pairs; p++) out[p] += a * one[p] + b * two[p];
-    return out;
+  // The mean stress of unit n with resistance to growth, six numbers as strains have.
+  meanStress(first, second, n, out) {
+    const shear = this.scale * this.moduli[2 * n], bulk = this.scale * this.moduli[2 * n + 1];
+    const p = 0.5 - this.growth, q = 0.5 + this.growth, one = first.e, two = second.e;
+    for (let c = 0, at = 6 * n; c < 6; c++, at++) out[c] = p * one[at] + q * two[at];
+    const pressure = bulk * (out[0] + out[1] + out[2]);
+    for (let c = 0; c < 6; c++) out[c] = shear * out[c] + (c < 3 ? pressure : 0);
   }
 
   between(first, second) {
-    const { modes, growth } = this, [a, b] = this.parts, tension = this.tension(first, second);
-    const out = times(this.cross, weighted(first.pair, a, second.pair, b), modes);
-    const middle = weighted(first.z, 0.5, second.z, 0.5);
-    const linear = times(this.linear, weighted(first.z, -growth, second.z, growth), modes);
-    for (let i = 0, at = 0; i < modes; i++) {
-      out[i] += linear[i];
-      for (let j = 0; j < i; j++, at++) { out[i] += tension[at] * middle[j]; out[j] += tension[at] * middle[i]; }
-      out[i] += tension[at++] * middle[i];
+    const { units, moduli, stress, scale } = this, s = new Float64Array(6);
+    for (let n = 0, o = 0; n < units; n++, o += 9) {
+      this.meanStress(first, second, n, s);
+      const shear = scale * moduli[2 * n], bulk = scale * moduli[2 * n + 1], x = s[0], y = s[1], z = s[2], u = s[3], v = s[4], w = s[5];
+      const at = (c) => (first.h[o + c] + second.h[o + c]) / 2;
+      const a = at(0), b = at(1), c = at(2), d = at(3), f = at(4), g = at(5), p = at(6), q = at(7), r = at(8);
+      const pressure = bulk * (a + f + r), yz = shear * (g + q) / 2, xz = shear * (c + p) / 2, xy = shear * (b + d) / 2;
+      stress[o] = -(x + a * x + b * w + c * v - shear * a - pressure);
+      stress[o + 1] = -(w + a * w + b * y + c * u - xy);
+      stress[o + 2] = -(v + a * v + b * u + c * z - xz);
+      stress[o + 3] = -(w + d * x + f * w + g * v - xy);
+      stress[o + 4] = -(y + d * w + f * y + g * u - shear * f - pressure);
+      stress[o + 5] = -(u + d * v + f * u + g * z - yz);
+      stress[o + 6] = -(v + p * x + q * w + r * v - xz);
+      stress[o + 7] = -(u + p * w + q * y + r * u - yz);
+      stress[o + 8] = -(z + p * v + q * u + r * z - shear * r - pressure);
     }
-    return out.map((value) => -this.scale * value);
+    return timesTransposed(this.cells, stress, this.modes);
   }
 
-  // T + J(mean z)^T G J(z_2) (1 + 2 growth) - linear, with J = dy/dz and T the stress with e_ij; in compressed cells an
-  // isotropic tension makes it positive, as there.
+  // sum_n H_n^T (H S + (1 + 2 growth) F sigma(sym(F_2^T H)) - sigma(sym H)), F and S the means; an isotropic tension makes
+  // S of compressed cells positive (Gershgorin), as there.
   stiffening(first, second) {
-    const { modes: m, pairs, cross, table } = this, out = new Float64Array(m * m), z = second.z;
-    const middle = weighted(first.z, 0.5, z, 0.5);
-    const row = new Float64Array(m), left = new Float64Array(m * m), known = new Float64Array(pairs);
-    const [high, low] = [new Float64Array(pairs), new Float64Array(pairs)]; // derivatives of the scaled pairs by both modes
-    for (let i = 0, p = 0; i < m; i++) for (let j = 0; j <= i; j++, p++) {
-      high[p] = this.scales[p] * z[j]; low[p] = this.scales[p] * z[i];
+    if (this.coarse !== this) {
+      Object.assign(this.coarse, { scale: this.scale, growth: this.growth });
+      return this.coarse.stiffening(this.coarse.state(first.z), this.coarse.state(second.z));
     }
-    for (let i = 0, p = 0; i < m; i++) for (let j = 0; j <= i; j++, p++) {
-      // row = the pair's row of G J(z_2); with the pair's derivatives at the mean it goes to rows i and j.
-      for (let k = 0, q = 0, at = p * pairs; k < m; k++) {
-        let sum = 0, more = 0, l = 0;
-        for (; l + 1 < k; l += 2, q += 2, at += 2) { // two sums at once, as in `times`
-          const g = table[at], h = table[at + 1];
-          sum += g * high[q]; more += h * high[q + 1];
-          row[l] += g * low[q]; row[l + 1] += h * low[q + 1];
-        }
-        if (l < k) { const g = table[at++]; sum += g * high[q]; row[l] += g * low[q++]; }
-        row[k] = sum + more + table[at++] * low[q++];
-      }
-      const own = this.scales[p];
-      for (let k = 0; k < m; k++) row[k] = own * row[k] + cross[k * pairs + p];
-      let sum = 0;
-      for (let k = 0; k < m; k++) sum += (row[k] - cross[k * pairs + p]) * z[k];
-      known[p] = sum / 2; // the pair's row of G times the pairs
-      const zi = middle[i], zj = middle[j];
-      for (let k = 0; k < m; k++) out[i * m + k] += zj * row[k];
-      if (i !== j) for (let k = 0; k < m; k++) out[j * m + k] += zi * row[k];
-    }
-    second.pulled ??= known;
-    for (let i = 0; i < m; i++) { // the modes' own rows of G J(z_2)
-      for (let k = 0, p = 0; k < m; k++) {
-        let sum = 0;
-        for (let l = 0; l < k; l++, p++) { const g = cross[i * pairs + p]; sum += g * z[l]; left[i * m + l] += g * z[k]; }
-        left[i * m + k] += sum + cross[i * pairs + p++] * z[k];
-      }
-    }
-    const tension = this.tension(first, second), squares = this.stretched(first, second), grown = 1 + 2 * this.growth;
-    for (let i = 0, p = 0; i < m; i++) for (let j = 0; j <= i; j++, p++) {
-      const both = tension[p] + squares[p];
-      for (const at of i === j ? [i * m + i] : [i * m + j, j * m + i]) {
-        out[at] = this.scale * (both + grown * (out[at] + left[at]) + 2 * this.growth * this.linear[at]);
-      }
-    }
-    return out;
-  }
-
-  // sum_n t_n of H_n^T H_n, with t_n >= 0 the tension that makes the mean stress of unit n positive (Gershgorin).
-  stretched(first, second) {
-    const { units, pairs, moduli, squares } = this, out = new Float64Array(pairs), [a, b] = this.parts;
-    const one = this.strains(first), two = this.strains(second), s = new Float64Array(6);
-    for (let n = 0; n < units; n++) {
-      for (let c = 0; c < 6; c++) s[c] = a * one[6 * n + c] + b * two[6 * n + c];
-      const pressure = moduli[2 * n + 1] * (s[0] + s[1] + s[2]);
-      for (let c = 0; c < 6; c++) s[c] = moduli[2 * n] * s[c] + (c < 3 ? pressure : 0);
+    const { units, modes: m, cells, moduli, scale, turned } = this, out = new Float64Array(m * m), s = new Float64Array(6);
+    const mean = new Float64Array(9), last = new Float64Array(9), grown = 1 + 2 * this.growth;
+    for (let n = 0, o = 0; n < units; n++, o += 9) {
+      this.meanStress(first, second, n, s);
       const yz = Math.abs(s[3]), xz = Math.abs(s[4]), xy = Math.abs(s[5]);
-      const least = Math.min(s[0] - xy - xz, s[1] - xy - yz, s[2] - xz - yz);
-      if (least >= 0) continue;
-      for (let p = 0, at = n * pairs; p < pairs; p++) out[p] -= least * squares[at++];
+      const tension = Math.max(0, xy + xz - s[0], xy + yz - s[1], xz + yz - s[2]);
+      const x = s[0] + tension, y = s[1] + tension, z = s[2] + tension, u = s[3], v = s[4], w = s[5];
+      for (let c = 0; c < 9; c++) {
+        const one = c % 4 === 0 ? 1 : 0;
+        mean[c] = one + (first.h[o + c] + second.h[o + c]) / 2; last[c] = one + second.h[o + c];
+      }
+      const shear = scale * moduli[2 * n], bulk = scale * moduli[2 * n + 1], from = o * m;
+      for (let k = 0; k < m; k++) {
+        const h = (c) => cells[from + c * m + k];
+        const a = h(0), b = h(1), c = h(2), d = h(3), f = h(4), g = h(5), p = h(6), q = h(7), r = h(8), l = last;
+        // Stress of the strain sym(F_2^T H), and that of sym H.
+        const sheared = grown * shear, half = sheared / 2;
+        const xx = l[0] * a + l[3] * d + l[6] * p, yy = l[1] * b + l[4] * f + l[7] * q, zz = l[2] * c + l[5] * g + l[8] * r;
+        const pressure = grown * bulk * (xx + yy + zz), small = bulk * (a + f + r);
+        const tx = sheared * xx + pressure, ty = sheared * yy + pressure, tz = sheared * zz + pressure;
+        const tu = half * (l[1] * c + l[4] * g + l[7] * r + l[2] * b + l[5] * f + l[8] * q);
+        const tv = half * (l[0] * c + l[3] * g + l[6] * r + l[2] * a + l[5] * d + l[8] * p);
+        const tw = half * (l[0] * b + l[3] * f + l[6] * q + l[1] * a + l[4] * d + l[7] * p);
+        const su = shear * (g + q) / 2, sv = shear * (c + p) / 2, sw = shear * (b + d) / 2;
+        turned[k] = a * x + b * w + c * v + mean[0] * tx + mean[1] * tw + mean[2] * tv - shear * a - small;
+        turned[m + k] = a * w + b * y + c * u + mean[0] * tw + mean[1] * ty + mean[2] * tu - sw;
+        turned[2 * m + k] = a * v + b * u + c * z + mean[0] * tv + mean[1] * tu + mean[2] * tz - sv;
+        turned[3 * m + k] = d * x + f * w + g * v + mean[3] * tx + mean[4] * tw + mean[5] * tv - sw;
+        turned[4 * m + k] = d * w + f * y + g * u + mean[3] * tw + mean[4] * ty + mean[5] * tu - shear * f - small;
+        turned[5 * m + k] = d * v + f * u + g * z + mean[3] * tv + mean[4] * tu + mean[5] * tz - su;
+        turned[6 * m + k] = p * x + q * w + r * v + mean[6] * tx + mean[7] * tw + mean[8] * tv - sv;
+        turned[7 * m + k] = p * w + q * y + r * u + mean[6] * tw + mean[7] * ty + mean[8] * tu - su;
+        turned[8 * m + k] = p * v + q * u + r * z + mean[6] * tv + mean[7] * tu + mean[8] * tz - shear * r - small;
+      }
+      addProduct(out, cells, from, turned, m);
+      addProduct(out, cells, from + 3 * m, turned, m, 3 * m);
+      addProduct(out, cells, from + 6 * m, turned, m, 6 * m);
     }
     return out;
   }
 
-  // Green's strain of every unit: xx, yy, zz, yz, xz, xy.
-  strains(state) {
-    if (state.strains) return state.strains;
-    const h = times(this.cells, state.z, 9 * this.units), out = new Float64Array(6 * this.units);
-    const at = [[0, 0], [1, 1], [2, 2], [1, 2], [0, 2], [0, 1]];
-    for (let n = 0; n < this.units; n++) for (let c = 0; c < 6; c++) {
-      const [i, j] = at[c], o = 9 * n;
-      const turned = h[o + i] * h[o + j] + h[o + 3 + i] * h[o + 3 + j] + h[o + 6 + i] * h[o + 6 + j];
-      out[6 * n + c] = (h[o + 3 * i + j] + h[o + 3 * j + i] + turned) / 2;
+  potential({ h, e }) {
+    let sum = 0;
+    for (let n = 0, o = 0, at = 0; n < this.units; n++, o += 9, at += 6) {
+      const shear = this.moduli[2 * n], bulk = this.moduli[2 * n + 1];
+      const whole = shear * squareOf(e[at], e[at + 1], e[at + 2], e[at + 3], e[at + 4], e[at + 5]);
+      const small = shear * squareOf(h[o], h[o + 4], h[o + 8], (h[o + 5] + h[o + 7]) / 2, (h[o + 2] + h[o + 6]) / 2, (h[o + 1] + h[o + 3]) / 2);
+      sum += whole - small + bulk * ((e[at] + e[at + 1] + e[at + 2]) ** 2 - (h[o] + h[o + 4] + h[o + 8]) ** 2);
     }
-    return (state.strains = out);
-  }
-
-  potential(state) {
-    const once = dotOf(state.z, times(this.cross, state.pair, this.modes));
-    return this.scale * (once + dotOf(state.pair, this.pulled(state)) / 2);
+    return this.scale * sum / 2;
   }
 }
+
+// E : E of a symmetric matrix.
+const squareOf = (x, y, z, yz, xz, xy) => x * x + y * y + z * z + 2 * (yz * yz + xz * xz + xy * xy);
 
 // Springs between units (gausim/models/template/springs.py).
 class Springs {

@@ -14,9 +14,6 @@ from gausim.core import Cameras, GaussianScene
 from gausim.io.files import write_durably
 from gausim.io.player import packed, rendered, splat_arrays, view_settings
 
-# What is in -1..1 is stored in 16 bits, in equal steps: near 1 these are finer than half floats.
-STEPS = 32767
-
 
 @dataclass(frozen=True)
 class Start:
@@ -68,12 +65,8 @@ def save_page(
         DataError: a number is not finite.
     """
     splats, scales = splat_arrays(page.scene)
-    step = dict(page.step)
-    if "quadratic" in step:
-        step["quadratic"], step["pair_scales"] = _scaled(step["quadratic"])
-        step["cells"] = page.scene.diagonal * step["cells"]
     splats["unit_of_kernel"] = page.unit_of_kernel.cpu().numpy()
-    content, index, sizes = packed({"splats": splats, "modes": _modes(page), "step": step})
+    content, index, sizes = packed({"splats": splats, "modes": _modes(page), "step": page.step})
     scene = page.scene
     settings = {
         **view_settings(scene, camera, up=up, background=background),
@@ -94,11 +87,3 @@ def _modes(page: ElasticPage) -> dict[str, np.ndarray]:
         "gradients": page.scene.diagonal * page.gradients, "wind": page.wind,
     }  # fmt: skip
     return {name: value.detach().cpu().numpy() for name, value in values.items()}
-
-
-def _scaled(triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A lower triangle by rows over the roots of its diagonal, in :data:`STEPS`, and these roots."""
-    count = int((2 * len(triangle)) ** 0.5)
-    rows, columns = np.tril_indices(count)
-    roots = np.sqrt(np.maximum(triangle[rows == columns], np.finfo(np.float32).tiny))
-    return (STEPS * triangle / (roots[rows] * roots[columns])).round().astype(np.int16), roots / STEPS**0.5

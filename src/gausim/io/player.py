@@ -20,8 +20,8 @@ from gausim.core import Cameras, DataError, GaussianScene, Trajectory
 from gausim.io.files import write_durably
 from gausim.io.motion import motion_arrays
 
-# Arrays that are stored as half floats.
-HALF = ("quats", "opacities", "base", "gradients", "cells", "moved")
+# Arrays that are stored as half floats: none of them drives a simulated motion.
+HALF = ("quats", "opacities", "base", "gradients", "moved")
 # Levels of the stored spherical harmonics above degree 0, each way.
 _LEVELS = 127
 

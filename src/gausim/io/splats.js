@@ -1,5 +1,5 @@
 // Gaussians that follow units, as pictures: x_k = x_c + G_c (X_k - X_c), covariance G S G^T, colours looked up at Q^T d.
-// Every frame, a first pass projects each Gaussian once into textures; a second draws them as quads from back to front.
+// Every frame, a first pass projects each Gaussian once into textures; a second draws them as triangles from back to front.
 "use strict";
 
 const SHIFT = 11, WIDTH = 1 << SHIFT; // of all textures that are lists [texels]
@@ -108,7 +108,7 @@ class Painter {
     }
     Object.assign(this, { gl, canvas, count, rows: rows(count), background });
     this.project = program(gl, "whole", "project");
-    this.quads = program(gl, "quads", "blend");
+    this.triangles = program(gl, "triangles", "blend");
     this.lists = lists.map((list) => texture(gl, list, this.rows));
     const higher = padded(motion.sh, above * count);
     this.harmonics = texture(gl, higher, Math.max(rows(above * count), 1), gl.RGBA8_SNORM, gl.BYTE);
@@ -121,11 +121,6 @@ class Painter {
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, made, 0));
     gl.drawBuffers([0, 1, 2].map((i) => gl.COLOR_ATTACHMENT0 + i));
     this.order = texture(gl, null, this.rows, gl.R32UI);
-    // One draw call of all quads: instances of four corners are slow where GL is computed by software.
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const corner = (i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6];
-    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => corner(i));
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.useProgram(this.project);
     const scales = Float32Array.from({ length: 15 }, (_, i) => 127 * (motion.sh_scales[i] || 0)); // of values in -1..1
     gl.uniform1fv(gl.getUniformLocation(this.project, "scales"), scales);
@@ -155,8 +150,8 @@ class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    this.use(this.quads, ["places", "ellipses", "colors"], this.made, size);
-    gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
+    this.use(this.triangles, ["places", "ellipses", "colors"], this.made, size);
+    gl.drawArrays(gl.TRIANGLES, 0, 3 * this.count); // one each: where GL is computed by software, more are slow
   }
 
   use(made, names, textures, size) {

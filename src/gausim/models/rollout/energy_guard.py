@@ -36,7 +36,7 @@ class EnergyGuard:
     Far outside the motion seen in training neither template nor network means anything, and strong forces could lead
     there. A ``ceiling`` prevents this: a force that would exceed it is reduced to a fraction, and a step that still
     exceeds it is shortened to the longest fraction below it. The ceiling thus bounds the deformation that forces can
-    cause.
+    cause: no frame has more than twice its energy.
     """
 
     def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, *, ceiling: float | None = None) -> None:
@@ -70,39 +70,42 @@ class EnergyGuard:
         energy, limit = self._energy(result.following(state)), max(self._last)
         if energy > limit:
             result, energy = self._held_back(state, force, energy, limit)
-        if self._ceiling is not None and energy > self._ceiling:
+        if self._ceiling is not None and not self._is_below(result.positions, state, self._ceiling):
             self.limited += 1
-            if force is not None:
-                result, energy = self._weakened(state, force, self._ceiling)
-            if energy > self._ceiling:
-                result, energy = self._cut_short(result, state, self._ceiling)
+            result, energy = self._limited(result, state, force, self._ceiling)
         lost = float(self._model.dissipated(self._prepared, result.following(state), state.previous))
         self._last = deque((before - lost for before in self._last), self._last.maxlen)
         self._last.append(energy)
         self._last_frame = result
         return result
 
-    def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Frame, float]:
-        """The template's step with the largest tried fraction of the force below the ceiling, or without the force."""
-        for scale in WEAKER:
-            frame, energy = self._corrected(state, scale * force if scale else None, 0.0)
-            if energy <= ceiling:
-                break
-        return frame, energy
+    def _is_below(self, x: Tensor, state: SimState, ceiling: float, standing: float = 0.0) -> bool:
+        """Whether a step to x is below the ceiling, and below twice the ceiling at rest at its end.
+
+        E is evaluated at the midpoint of a step; fast modes have more potential energy at its end. ``standing`` is the
+        energy of standing still; what exceeds the ceiling but not that is below, too.
+        """
+        if self._energy(SimState(x, state.positions)) > max(ceiling, standing):
+            return False
+        return self._energy(SimState(x, x)) <= max(2 * ceiling, standing)
+
+    def _limited(self, frame: Frame, state: SimState, force: Tensor | None, ceiling: float) -> tuple[Frame, float]:
+        """The template's step with the largest tried fraction of the force below the ceiling, or a shortened step."""
+        if force is not None:
+            for scale in WEAKER:
+                frame, energy = self._corrected(state, scale * force if scale else None, 0.0)
+                if self._is_below(frame.positions, state, ceiling):
+                    return frame, energy
+        return self._cut_short(frame, state, ceiling)
 
     def _cut_short(self, frame: Frame, state: SimState, ceiling: float) -> tuple[Frame, float]:
-        """The longest fraction of a step below the ceiling (at least the energy of standing still), by bisection.
-
-        Both E in motion and E at rest at the end must stay below: E is evaluated at the midpoint of a step, and the
-        potential energy may be larger at its end.
-        """
-        limit = max(ceiling, self._energy(SimState(state.positions, state.positions)))
+        """The longest fraction of a step below the ceiling, by bisection."""
+        standing = self._energy(SimState(state.positions, state.positions))
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             scale = (low + high) / 2
-            x = self._part(frame, state, scale).positions
-            needed = max(self._energy(SimState(x, state.positions)), self._energy(SimState(x, x)))
-            low, high = (scale, high) if needed <= limit else (low, scale)
+            below = self._is_below(self._part(frame, state, scale).positions, state, ceiling, standing)
+            low, high = (scale, high) if below else (low, scale)
         part = self._part(frame, state, low)
         return part, self._energy(part.following(state))
 
