@@ -13,7 +13,8 @@ import torch
 
 from benchmarks.harness import Options, Row
 from gausim import __version__
-from gausim.core import DataError
+from gausim.core import DataError, GausSimError
+from gausim.core.errors import sentence
 from gausim.runs import provenance
 
 CASES = {
@@ -85,4 +86,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except GausSimError as error:
+        sys.exit(f"error: {sentence(error)}")

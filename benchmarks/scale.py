@@ -35,9 +35,10 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
         ConfigError: the model has no warm start.
     """
     from gausim.compose.build import build
+    from gausim.compose.command import with_data_directories
     from gausim.compose.config import compose
 
-    module, data = build(compose(list(overrides or OVERRIDES)))
+    module, data = build(compose(with_data_directories(overrides or OVERRIDES)))
     if not isinstance(module, GausSimModule):
         raise ConfigError("benchmarks scale: expected a model that learns by batches, such as model=gausim.")
     return measure(options, module, data, module.plan)

@@ -29,9 +29,10 @@ def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:
         ConfigError: the model is fitted to one sequence after another.
     """
     from gausim.compose.build import build
+    from gausim.compose.command import with_data_directories
     from gausim.compose.config import compose
 
-    words = list(overrides or OVERRIDES)
+    words = with_data_directories(overrides or OVERRIDES)
     own, rival = compose(words), compose([*(w for w in words if not w.startswith("model")), RIVAL])
     made = [build(config) for config in (own, rival)[: 1 if own.model == rival.model else 2]]
     modules = [module for module, _ in made if isinstance(module, GausSimModule)]
