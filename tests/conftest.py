@@ -80,6 +80,14 @@ def toy_run(trainings: Trainings) -> Path:
 
 
 @pytest.fixture(scope="session")
+def quick_evaluations() -> Iterator[None]:
+    """Collecting garbage before the memory is counted takes most of a prediction."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gausim.runs.cost._begin", lambda cuda: None)
+        yield
+
+
+@pytest.fixture(scope="session")
 def _played(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     from helpers.played import played_run
 

@@ -54,10 +54,3 @@ def test_pushes_draws_and_resets(played) -> None:
         sim.apply_force("head", direction="x", weights=1)
     with pytest.raises(DataError, match="no object"):
         gausim.load(played.run_dir, object="cup")
-
-
-def test_it_is_the_rollout_where_nothing_acts(played) -> None:
-    sim = gausim.load(played.run_dir, sequence="seq_001")
-    sim.step(10)
-    whole = played.module.predict(1, 10)
-    assert torch.equal(sim.trajectory.positions, whole.positions)

@@ -322,12 +322,3 @@ def test_targets_and_arguments_that_do_not_exist_are_named() -> None:
         instantiate(config)
     with pytest.raises(TypeError):  # a defect inside the constructor stays what it is
         instantiate({"_target_": "torch.nn.Linear", "in_features": "two", "out_features": 3})
-
-
-def test_injected_objects_are_not_copied_and_partials_await_their_arguments() -> None:
-    layer = torch.nn.Linear(2, 3)
-    optimizer = instantiate({"_target_": "torch.optim.SGD", "lr": 0.5}, params=layer.parameters())
-    assert optimizer.param_groups[0]["params"][0] is layer.weight
-    factory = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5})
-    optimizer = factory(torch.nn.Linear(2, 3).parameters())
-    assert optimizer.param_groups[0]["lr"] == 0.5

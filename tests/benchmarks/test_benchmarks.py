@@ -20,7 +20,6 @@ from gausim.losses import Objective
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
-from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.plan import TrainingPlan
@@ -76,11 +75,6 @@ def test_the_whole_of_a_training_is_the_sum_of_its_stages(tmp_path: Path) -> Non
     assert found["images"].value == pytest.approx(240 * found["optimiser step, per sequence"].value / 3600)
 
 
-def test_both_sides_of_a_renderers_ratio_compute_the_same() -> None:
-    scene = render.splats(200, 33, 25, views=2)
-    found, expected = (scene.both(renderer) for renderer in (CpuRenderer(), ReferenceRenderer()))
-    for value, truth in zip(found, expected, strict=True):
-        assert float((value - truth).norm() / truth.norm()) < 1e-2
 
 
 def test_peak_counts_what_is_held_at_one_time() -> None:

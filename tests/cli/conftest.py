@@ -4,10 +4,7 @@ from pathlib import Path
 
 import pytest
 from helpers import joint_runs
-from helpers.evaluations import make_quick
 from helpers.shared import Shared
-from helpers.sweeps import Sweeps
-from helpers.toy_runs import Trainings
 
 from gausim.cli import evaluate, training_run
 from gausim.cli import train as command
@@ -31,14 +28,9 @@ def joint(toy: Path, other: Path, shared: Shared) -> Path:
     return shared("joint", train)
 
 
-@pytest.fixture(scope="module")
-def do(trainings: Trainings, tmp_path_factory: pytest.TempPathFactory) -> Sweeps:
-    return Sweeps(trainings, tmp_path_factory.mktemp("sweeps"))
-
-
 @pytest.fixture(autouse=True)
-def quick_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
-    make_quick(monkeypatch)
+def quick(quick_evaluations: None) -> None:
+    """All evaluations."""
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from gausim.cli import inspect as command
 from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.io.ply import load_scene, save_scene
-from gausim.pictures import kernels
 
 
 @pytest.fixture
@@ -75,13 +74,3 @@ def test_a_trained_run_tells_what_it_has_learned_and_no_more(toy_run: Path, tmp_
     assert len(np.unique(values[values > 0])) > 1
     assert main([*asked, "stiffness"]) == 2
     assert "has learned density. Take one of these, or a run of model=gausim" in capsys.readouterr().err
-
-
-def test_scales_leave_out_extremes_and_unknown_kernels_are_grey() -> None:
-    values = torch.cat((torch.linspace(1, 2, 1000), torch.tensor([1e6, torch.nan])))
-    scale = kernels.property_scale(values)
-    assert 1 <= scale.vmin < 1.05 and 1.95 < scale.vmax <= 2
-    colors = kernels.property_colors(values, scale)
-    assert torch.equal(colors[-2], colors[999]) and float(colors[-1].std()) < 1e-6 and float(colors[0].std()) > 0.05
-    same = kernels.property_scale(torch.ones(5))
-    assert same.vmin < 1 < same.vmax

@@ -48,13 +48,6 @@ def test_what_is_no_command_is_wrong_usage(argv, told, capsys: pytest.CaptureFix
     assert told in capsys.readouterr().err
 
 
-def test_arguments_and_status_pass_through(command) -> None:
-    seen: list[str] = []
-    command(lambda argv: seen.extend(argv) or 7)
-    assert cli.main(["fake", "--size", "3"]) == 7
-    assert seen == ["--size", "3"]
-
-
 def test_our_errors_are_one_line_without_traceback(command, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     command(raising(SceneError("rose.ply: expected 3 values, got 2. Export it again.")))
     assert cli.main(["fake"]) == 2

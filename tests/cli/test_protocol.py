@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers.evaluations import make_quick
 from helpers.simulators import LEVELS
 from omegaconf import OmegaConf
 
@@ -66,7 +65,6 @@ def trained(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamesp
 
 @pytest.fixture
 def run(trained: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    make_quick(monkeypatch)
     monkeypatch.setattr("gausim.cli.evaluate_run.error_figure", lambda *unused, **options: None)
     return Path(shutil.copytree(trained.run, tmp_path / "run"))
 

@@ -5,11 +5,14 @@ import os
 import random
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import hydra
 import pytest
-from helpers.digests import digest
-from helpers.sweeps import Sweeps, dying, history, write_toy_object
+from helpers.plain import digest
+from helpers.toy_object import write_toy_object
+from helpers.toy_runs import Trainings
+from helpers.toy_runs import killed as dying
 from hydra.core.hydra_config import HydraConfig
 
 from gausim.compose import root as _conf
@@ -21,8 +24,29 @@ SAVED = "gausim.runs.checkpoint.read_checkpoint"
 STEP = "gausim.training.module.GausSimModule.training_step"
 
 
-def runs_of(do: Sweeps, name: str) -> list[Path]:
-    return sorted((do.folder / name).rglob("seed_*"))
+class Sweeps:
+    """Sweeps of a toy object: name, overrides, and how it dies; gives exit status and output."""
+
+    def __init__(self, trainings: Trainings) -> None:
+        self.toy, *given = trainings.given
+        self._order, self._folder = trainings.order, trainings.folder
+        self._given = ("-m", *given, "data.sequences=2", "plan.t_max=2", "plan.epochs=2", "trainer=cpu", "logger=none")
+
+    def __call__(self, name: str, *overrides: str, **death: Any) -> tuple[int, str]:
+        return self._order([*self._given, self.toy, f"name=sweep_{name}", *overrides], **death)
+
+    def runs(self, name: str) -> list[Path]:
+        return sorted((self._folder / f"sweep_{name}").rglob("seed_*"))
+
+
+@pytest.fixture(scope="module")
+def do(trainings: Trainings) -> Sweeps:
+    return Sweeps(trainings)
+
+
+def history(run: Path) -> list[str]:
+    """The events of a run."""
+    return [json.loads(line)["event"] for line in (run / "events.jsonl").read_text().splitlines()]
 
 
 def steps(run: Path) -> int:
@@ -34,7 +58,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
     assert do("cut", "seed=0,1", **dying(FINISH, 2))[0] == -9
     status, output = do("cut", "seed=0,1")
     assert status == 0 and "sweep of 2 jobs: 1 trained, 1 finished before" in output, output
-    first, second = runs_of(do, "cut")
+    first, second = do.runs("cut")
     assert f"left out, finished before: {first}" in output and f"left out, finished before: {second}" not in output
     expected = [["started", "finished"], ["started", "resumed", "finished"]]
     assert [history(run) for run in (first, second)] == expected and steps(first) == steps(second) == 8
@@ -52,21 +76,21 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
 @pytest.mark.slow
 def test_a_job_that_fails_before_its_first_step_stops_no_other_and_leaves_nothing(do: Sweeps, tmp_path: Path) -> None:
     late = tmp_path / "late"
-    swept = (f"data.root={late},{do.folder}/toy", "seed=0")
+    swept = (do.toy.replace("=", f"={late},"), "seed=0")
     status, output = do("mixed", *swept)
     assert status == 2 and "sweep of 2 jobs: 1 trained, 1 failed" in output, output
     assert f"DataError: {late}" in output and "Traceback" not in output
-    assert [steps(run) for run in runs_of(do, "mixed")] == [8]
+    assert [steps(run) for run in do.runs("mixed")] == [8]
     write_toy_object(late, frames=8)
     status, output = do("mixed", *swept)
     assert status == 0 and "1 trained, 1 finished before" in output, output
-    assert [steps(run) for run in runs_of(do, "mixed")] == [8, 8]
+    assert [steps(run) for run in do.runs("mixed")] == [8, 8]
 
 
 @pytest.mark.slow
 def test_a_job_that_failed_later_is_tried_again_on_demand(do: Sweeps) -> None:
     assert do("later", "seed=0", **dying(SAVED, 2))[0] == -9
-    (run,) = runs_of(do, "later")
+    (run,) = do.runs("later")
     (run / "FAILED").write_text("ValueError: no\n")
     status, output = do("later", "seed=0")
     assert status == 2 and "left out, failed before" in output, output
@@ -106,8 +130,8 @@ def test_jobs_side_by_side_leave_what_one_after_another_would(do: Sweeps, launch
     assert status == 0 and "sweep of 2 jobs: 2 trained" in output, output
     status, output = do(name, "seed=0,1,2", *launcher)
     assert status == 0 and "sweep of 3 jobs: 1 trained, 2 finished before" in output, output
-    assert [history(run) for run in runs_of(do, name)] == 3 * [["started", "finished"]]
-    assert [learned(run) for run in runs_of(do, name)[:2]] == [learned(run) for run in runs_of(do, "in_turn")]
+    assert [history(run) for run in do.runs(name)] == 3 * [["started", "finished"]]
+    assert [learned(run) for run in do.runs(name)[:2]] == [learned(run) for run in do.runs("in_turn")]
 
 
 @pytest.mark.slow
@@ -127,10 +151,10 @@ def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Sweeps) -
     status, output = do("disturbed", *swept)
     assert status == 0 and "finished before" in output, output
     told.update(line for line in output.splitlines() if line.startswith("run: "))
-    runs = runs_of(do, "disturbed")
+    runs = do.runs("disturbed")
     assert told == Counter(f"run: {run.as_uri()}" for run in runs) and len(runs) == 6  # each came to its end once
     resumed = 0
-    for run, whole in zip(runs, runs_of(do, "undisturbed"), strict=True):
+    for run, whole in zip(runs, do.runs("undisturbed"), strict=True):
         events = history(run)
         assert events.count("finished") == 1 and events[-1] == "finished"
         assert steps(run) == steps(whole) == 60 and learned(run) == learned(whole)

@@ -1,4 +1,3 @@
-import json
 import os
 import shutil
 import subprocess
@@ -78,20 +77,6 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     table = load_results(RUN / "evaluation" / "metrics.json").table
     found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim", "points")}
     assert float(watched[-1]["error_unseen"]) == pytest.approx(found["unseen", "error_3d_ratio"], rel=1e-3)
-
-
-def test_faults_of_the_data_are_told_again_at_the_end(
-    arguments: list[str], toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one_view = Path(shutil.copytree(toy, tmp_path / "one_view"))
-    facts = json.loads((one_view / "dataset.json").read_text())
-    views = facts["train_views"] + facts["heldout_views"]
-    (one_view / "dataset.json").write_text(json.dumps({**facts, "train_views": views[:1], "heldout_views": views[1:]}))
-    assert command.main([*arguments, f"data.root={one_view}", "doctor=true", "plan.epochs=1"]) == 0
-    end = capsys.readouterr().out.partition("Trained for")[2]
-    assert "The data are faulty" in end and "one training view only" in end and "gausim doctor" in end
-    faults = json.loads((RUN / "FINISHED").read_text())["data_faults"]
-    assert len([fault for fault in faults if "one training view only" in fault]) == 1
 
 
 def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> None:

@@ -2,7 +2,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import lightning as L
 import pytest
 import torch
 from helpers.blob import make_object
@@ -30,13 +29,6 @@ def plan(**options: Any) -> TrainingPlan:
 
 def sampler(batch_size: int = 2, **options: int) -> SequenceBatchSampler:
     return SequenceBatchSampler(5, plan=plan(repeats=3, batch_size=batch_size), **{"seed": 4, **options})
-
-
-def test_frames_that_are_seen_and_not_trained_on_are_named(blob: Path) -> None:
-    data = ReadyDataModule(blob, plan=plan(t_max=15))
-    assert len(data.introduction()) == len(data.objects)
-    fewer = ReadyDataModule(blob, plan=plan(t_max=9))
-    assert "frames 10..15 are seen, but not trained on (plan.t_max=9)" in fewer.introduction()[1]
 
 
 def test_training_cannot_hand_out_unseen_frames_and_heldout_views(blob: Path) -> None:
@@ -138,41 +130,3 @@ def test_roots_that_are_not_there(two_objects: Path, tmp_path: Path) -> None:
         _ = ReadyDataModule([{"root": two_objects, "scen": "x"}]).objects
     with pytest.raises(ConfigError, match="of one object"):
         _ = ReadyDataModule(two_objects, scene="x.ply").objects
-
-
-class Recorder(L.LightningModule):
-    """Notes what it is shown, and stops the run after some batches."""
-
-    def __init__(self, stop: int | None) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.ones(2))
-        self.stop, self.seen = stop, []
-
-    def training_step(self, batch, index: int) -> torch.Tensor:
-        self.seen.append((self.current_epoch, batch[0].steps, [s.sequence_id for s in batch]))
-        return self.weight.square().sum()
-
-    def on_train_batch_end(self, *_) -> None:
-        if self.stop and self.global_step == self.stop:
-            self.trainer.should_stop = True
-            self.trainer.save_checkpoint(Path(self.trainer.default_root_dir) / "stopped.ckpt")
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_resumed_run_sees_what_an_uninterrupted_one_sees(two_objects: Path, tmp_path: Path) -> None:
-    def fit(stop: int | None, checkpoint: Path | None = None) -> list:
-        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-        trainer = L.Trainer(
-            max_epochs=2, default_root_dir=tmp_path, accelerator="cpu", enable_model_summary=False, **quiet
-        )
-        recorder = Recorder(stop)
-        data = ReadyDataModule(two_objects, plan=plan())
-        trainer.fit(recorder, data, ckpt_path=checkpoint, weights_only=True)
-        return recorder.seen if stop is None else recorder.seen[:stop]
-
-    whole = fit(None)
-    assert [(epoch, steps) for epoch, steps, _ in whole] == [(0, 1)] * 3 + [(1, 2)] * 3
-    assert fit(2) + fit(None, tmp_path / "stopped.ckpt") == whole

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_prep.blender.meshes import Mesh, farthest_points, make_surface, read_mesh, refine
+from data_prep.blender.meshes import Mesh, make_surface, read_mesh, refine
 from gausim.core import DataError
 
 CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
@@ -116,11 +116,3 @@ def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("data_prep.blender.meshes.MOST_TRIANGLES", 5000)
     with pytest.raises(DataError, match="Remesh"):
         refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
-
-
-def test_farthest_points_are_far_from_each_other() -> None:
-    points = np.random.default_rng(2).uniform(0, 1, (400, 3))
-    chosen = points[farthest_points(points, 20)]
-    gaps = np.linalg.norm(chosen[:, None] - chosen, axis=-1) + np.eye(20)
-    assert gaps.min() > 0.25 and len(farthest_points(points[:5], 20)) == 5
-    assert farthest_points(np.zeros((9, 3)), 4).tolist() == [0]

@@ -1,10 +1,7 @@
 """A small elastic column under a network with random weights, and an interaction with it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-
-import pytest
 
 from gausim.core import Frame, GaussianScene, SimState
 from gausim.interaction.interaction import Interaction
@@ -15,18 +12,18 @@ from gausim.models.template.elastic import ElasticTemplate
 from helpers import bodies
 
 
-def _scene(count: int = 90) -> GaussianScene:
+def make_column(count: int = 90) -> GaussianScene:
     return replace(bodies.make_scene(count), name="column")
 
 
-def _model(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
+def make_simulator(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
     settings = {"template": partial(ElasticTemplate, modes=8), "output_scale": 0.01, "anchor": True}
     return bodies.make_model(scene, seed=seed, energy_guard_frames=passive, **settings)
 
 
-def _interaction(*, seed: int = 0, ceiling: float | None = None, **options: object) -> Interaction:
-    scene = _scene()
-    model, initial = _model(scene, seed=seed), SimState(scene.means, scene.means)
+def make_interaction(*, seed: int = 0, ceiling: float | None = None, **options: object) -> Interaction:
+    scene = make_column()
+    model, initial = make_simulator(scene, seed=seed), SimState(scene.means, scene.means)
     dynamics = SceneDynamics(model)
     dynamics.energy_ceiling = ceiling
     made_with = MadeWith.of(scene, model, initial, run="toy")
@@ -39,18 +36,3 @@ def steps(interaction: Interaction, count: int) -> Frame:
     for _ in range(count):
         frame = interaction.step()
     return frame
-
-
-@pytest.fixture(scope="session")
-def make_column() -> Callable[..., GaussianScene]:
-    return _scene
-
-
-@pytest.fixture(scope="session")
-def make_simulator() -> Callable[..., GausSim]:
-    return _model
-
-
-@pytest.fixture(scope="session")
-def make_interaction() -> Callable[..., Interaction]:
-    return _interaction

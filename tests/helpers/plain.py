@@ -1,5 +1,6 @@
 """What many tests make alike: scenes of round kernels, cameras that look at a place, changed JSON, pickled calls."""
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_flatten
 
 from gausim.core import Cameras, GaussianScene
 from gausim.ops.orbit import look_at
@@ -45,6 +47,19 @@ def edit_json(path: Path, change: Callable[[dict], object]) -> None:
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
+
+
+def digest(content: Any) -> str:
+    """SHA-256 of nested containers of tensors and plain values: bytes, types, shapes and order enter."""
+    leaves, layout = tree_flatten(content)
+    running = hashlib.sha256(str(layout).encode())
+    for leaf in leaves:
+        if isinstance(leaf, Tensor):
+            running.update(f"{leaf.dtype} {tuple(leaf.shape)}".encode() + leaf.detach().cpu().numpy().tobytes())
+        else:
+            assert leaf is None or type(leaf) in (bool, int, float, str, bytes), type(leaf)
+            running.update(repr(leaf).encode())
+    return running.hexdigest()
 
 
 class Call:

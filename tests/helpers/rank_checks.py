@@ -25,7 +25,7 @@ from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
 from helpers import toy_object
-from helpers.digests import digest
+from helpers.plain import digest
 from helpers.simulators import gausim
 
 SCENES = (0, 0, 1, 0, 1, 1)  # of sequences 0 to 5; the last is in no batch

@@ -13,7 +13,7 @@ import torch
 
 from gausim.runs.checkpoint import read_checkpoint
 from helpers import toy_object
-from helpers.digests import digest
+from helpers.plain import digest
 from helpers.shared import Shared
 from helpers.simulators import SMALLEST
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.column import steps
+from helpers.column import make_column, make_interaction, make_simulator, steps
 from msgspec.structs import replace as changed
 
 from gausim.core import ConfigError, DataError, DivergenceError, Frame, HandPath, SimState, Steppable, Stepper
@@ -38,7 +38,7 @@ def same(a, b) -> bool:
 
 
 @pytest.mark.parametrize("passive", [0, 6])
-def test_stepping_is_the_rollout_bit_for_bit(make_column, make_simulator, passive) -> None:
+def test_stepping_is_the_rollout_bit_for_bit(passive) -> None:
     scene = make_column()
     dynamics = SceneDynamics(make_simulator(scene, passive=passive))
     assert isinstance(dynamics, Steppable)
@@ -73,7 +73,7 @@ def play(live: Interaction) -> None:
     live.act(Gravity(X, 0.0))
 
 
-def test_a_session_is_replayed_bit_for_bit(make_interaction) -> None:
+def test_a_session_is_replayed_bit_for_bit() -> None:
     live = make_interaction(keep=None, seed=3)
     play(live)
     recorded, session = live.trajectory(), live.session()
@@ -87,7 +87,7 @@ def test_a_session_is_replayed_bit_for_bit(make_interaction) -> None:
     assert float(moved[3]) > 1e-3 and float(moved[13]) < float(moved[12])
 
 
-def test_replay_wants_what_the_session_was_made_with(make_interaction) -> None:
+def test_replay_wants_what_the_session_was_made_with() -> None:
     live = make_interaction()
     live.act(Force(Whole(), X, 1.0))
     live.step()
@@ -108,7 +108,7 @@ def test_replay_wants_what_the_session_was_made_with(make_interaction) -> None:
         replay(live, session)
 
 
-def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
+def test_a_force_is_a_multiple_of_the_weight() -> None:
     """On free matter, f = w m g for n steps moves it as w g does in n frames: Verlet's x, exactly."""
     scene = make_column()
 
@@ -187,7 +187,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
     assert float(shift()[50].norm()) > 0 and torch.equal(shift()[51], torch.zeros(3))
 
 
-def test_pinned_kernels_never_move(make_interaction) -> None:
+def test_pinned_kernels_never_move() -> None:
     live = make_interaction(keep=4)
     pinned, held = live.scene.pinned | ~live.scene.simulated, Kernels(tuple(range(70, 80)))
     live.act(Gravity(X, 1.0))
@@ -206,7 +206,7 @@ def test_pinned_kernels_never_move(make_interaction) -> None:
     assert live.trajectory().frames == 1 and live.tick == 0 and live.session().entries == ()
 
 
-def test_what_cannot_be_done_is_refused_and_not_recorded(make_interaction) -> None:
+def test_what_cannot_be_done_is_refused_and_not_recorded() -> None:
     live = make_interaction()
     foot = Kernels(tuple(live.scene.pinned.nonzero()[:, 0].tolist()))
     for event, message in (
@@ -226,7 +226,7 @@ def test_what_cannot_be_done_is_refused_and_not_recorded(make_interaction) -> No
     assert live.session().entries == () and live.acting == ()
 
 
-def test_it_says_that_forces_act_in_part(make_interaction) -> None:
+def test_it_says_that_forces_act_in_part() -> None:
     live = make_interaction(ceiling=1e-5)
     live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.01, frames=2))
     live.step()
@@ -283,7 +283,7 @@ class Broken:
         ("inf", "at frame 2 the covariance of kernel .* is not positive definite"),
     ],
 )
-def test_divergence_stops_until_a_reset(make_interaction, how, message) -> None:
+def test_divergence_stops_until_a_reset(how, message) -> None:
     live = make_interaction(keep=None)
     live._stepper = Broken(live, how)
     live.step()
@@ -302,7 +302,7 @@ def test_divergence_stops_until_a_reset(make_interaction, how, message) -> None:
 TO = (0.2, -0.1, 0.0)
 
 
-def test_pins_go_where_the_hand_goes_and_the_body_follows(make_interaction) -> None:
+def test_pins_go_where_the_hand_goes_and_the_body_follows() -> None:
     interaction = make_interaction()
     scene = interaction.scene
     interaction.step()
@@ -319,7 +319,7 @@ def test_pins_go_where_the_hand_goes_and_the_body_follows(make_interaction) -> N
     assert (frame.positions - scene.means)[free].norm(dim=1).max() > 0.02
 
 
-def test_a_session_with_a_hand_is_replayed_bit_for_bit(make_interaction) -> None:
+def test_a_session_with_a_hand_is_replayed_bit_for_bit() -> None:
     interaction = make_interaction()
     interaction.act(Force(Whole(), (1.0, 0.0, 0.0), 0.5, name="pull"))
     for number in range(12):
@@ -337,7 +337,7 @@ def _nodding(frames: int = 8) -> HandPath:
     return HandPath.of(torch.stack(poses), torch.zeros(4, dtype=torch.long))
 
 
-def test_a_session_follows_recorded_hands_until_the_user_takes_over(make_interaction) -> None:
+def test_a_session_follows_recorded_hands_until_the_user_takes_over() -> None:
     path = _nodding()
     interaction = make_interaction(hands=path.pose, keep=None)
     pinned, rest = interaction.scene.pinned, interaction.scene.means
@@ -362,7 +362,7 @@ def test_a_session_follows_recorded_hands_until_the_user_takes_over(make_interac
     assert torch.equal(interaction.step().positions, recorded.positions[1])
 
 
-def test_a_hand_that_is_moved_leaves_the_others_to_the_recording(make_column) -> None:
+def test_a_hand_that_is_moved_leaves_the_others_to_the_recording() -> None:
     scene = make_column()
     pins = scene.pinned.nonzero()[:, 0]
     hand = torch.full((scene.count,), -1).index_copy(0, pins, torch.arange(len(pins)) % 2)

@@ -68,20 +68,6 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(predicted, graph) 
     assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in model.predicted_levels]
 
 
-def test_batches_are_cached_and_edges_stay_within_members() -> None:
-    model = make_model([make_scene(70), make_scene(55, seed=1)])
-    batch = model.batch([0, 1])
-    assert model.batch((0, 1)) is batch and model.batch((1, 0)) is not batch
-    for level in batch.levels:
-        owner = torch.cat([torch.full((s.stop - s.start,), i) for i, s in enumerate(level.spans)])
-        positions = torch.zeros(level.count, 3)  # all at one place: neighbours are cut off by members only
-        for edges in (level.rest_edges, exact_edges("union", level, positions)):
-            assert edges.shape[1] > 0 and torch.equal(owner[edges[0]], owner[edges[1]])
-            assert bool((edges[1].diff() >= 0).all())
-            assert int(torch.bincount(edges[1]).max()) <= 12
-    assert {round(1 / float(v)) for v in batch.dt} == {24, 30}
-
-
 def test_absent_scene_gets_no_gradient() -> None:
     scenes = [make_scene(70), make_scene(55, seed=1)]
     model = make_model(scenes)

@@ -263,12 +263,6 @@ def test_hands_that_move_together_carry_the_body_rigidly() -> None:
     torch.testing.assert_close(rotation, rotation_of(0.2 * turn).expand_as(rotation), atol=1e-3, rtol=0)
 
 
-def test_the_static_shape_of_a_recorded_pose_is_computed_once() -> None:
-    path, shape = _path(lambda f, x: x + 0.01 * f), _frozen(_bar()).surroundings[0].shape
-    for frame in (-1, 3, 40, 99):
-        assert shape.at(path.pose(frame)) is shape.at(path.pose(frame))
-
-
 def test_a_bar_pulled_apart_comes_to_rest_stretched_evenly_and_thinner() -> None:
     scene = _bar()
     model = _frozen(scene, template=partial(NEURAL["template"], solid=SolidSettings(0.12, 0.0, free_modes=1)))

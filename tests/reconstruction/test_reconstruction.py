@@ -18,7 +18,7 @@ from gausim.data.images import write_rgba
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
 from gausim.ops.spherical_harmonics import evaluate_sh
-from gausim.reconstruction.reconstruction import ROUNDS, Reconstruction, ReconstructionOptions, reconstruct
+from gausim.reconstruction.reconstruction import ROUNDS, ReconstructionOptions, reconstruct
 from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet, measure, reduced
@@ -137,22 +137,6 @@ def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pyte
         reconstruct([train], RENDERER, options)
     with pytest.raises(DataError, match="need colours"):
         reconstruct([train], RENDERER, options, cloud=PointCloud(shell().points))
-
-
-def test_error_is_attributed_to_the_kernels_under_it(stills: ImageSet) -> None:
-    """Against the sum over pixels of the kernel's weight times the error, its weight found by drawing it alone."""
-    run = Reconstruction([stills], RENDERER, TINY, cloud=None, name="balls")
-    error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
-    error[18:22, 18:22] = 0.5
-    drawable = run.splats.drawable(stills.cameras.centers[0])
-    run._attribute(stills, 0, black, drawable, error)
-    means, covars, colors, opacities = (x.detach() for x in drawable)
-    for k in run.splats.error.topk(3).indices.tolist():
-        lit = torch.zeros_like(colors)
-        lit[k] = 1.0
-        rgb, _ = run._render(stills, 0, black, (means, covars, lit, opacities))
-        assert float(run.splats.error[k]) == pytest.approx(float((rgb.mean(-1) * error).sum()), rel=1e-3)
-    assert (run.splats.error == 0).any()
 
 
 def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:

@@ -5,54 +5,14 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
-import pytest
 from helpers.report_runs import config, evaluate, make_curves, page_of, study_of, write_run
 
 from gausim.report.media import error_curves
 from gausim.report.opening import MOST_OPENINGS, make_openings
-from gausim.report.verdict import merit, sentence
-from gausim.results.pivot import Pivot
-from gausim.results.table import NO_FORESIGHT, SCHEMA, Entry, Metric, ObjectInfo, Results
 
 EVIL = "<script>alert(1)</script>&\"'|`"
-
-
-def said(
-    error: float | None = 0.3, seen: float | None = 0.2, energy: float | None = 0.9, *, views: str = "points",
-    seeds: Sequence[float | None] = (), unseen: bool = True, repeats: bool = False, reference: str = "static",
-) -> tuple[str, float]:  # fmt: skip
-    """The sentence on an evaluation, and its merit."""
-    metric = "error_3d_ratio" if views == "points" else "l2_ratio"
-    splits = {"seen": (0, 16)} | ({"unseen": (16, 50)} if unseen else {})
-    table = []
-    for split in splits:
-        errors = (list(seeds) or [error]) if split == "unseen" else [seen]
-        table += [Entry("m", "method", "o", split, views, metric, i, e) for i, e in enumerate(errors) if e is not None]
-        if energy is not None:
-            table.append(Entry("m", "method", "o", split, views, "motion_energy", None, energy))
-    info = ObjectInfo(splits, reference, methods=["m"], notes={"m": [NO_FORESIGHT] * repeats})
-    metrics = {m: Metric(m) for m in (metric, "motion_energy")}
-    pivot = Pivot(Results(SCHEMA, objects={"o": info}, metrics=metrics, table=table))
-    return sentence(pivot, "o", "m", info), merit(pivot, "o", "m", info)
-
-
-def test_sentences_state_figures() -> None:
-    assert said() == (
-        "Unseen frames 16–49: 3D error 0.30 of the static prediction's (0.20 in seen frames), motion energy 0.90 of "
-        "the true motion's.",
-        0.3,
-    )
-    assert "l2 in the training views 0.30 of the" in said(views="train")[0]
-    assert "3D error 0.30 of the ballistic prediction's" in said(reference="ballistic")[0]
-    assert said(seeds=(0.3, 0.5))[0].endswith("mean of 2 seeds.") and said(seeds=(0.3, 0.5))[1] == pytest.approx(0.4)
-    assert said(repeats=True)[0].endswith("repeats its fitted frames instead of extrapolating.")
-    short, error = said(unseen=False)
-    assert short.startswith("Seen frames 0–15: 3D error 0.20 of the static prediction's, motion") and error == 0.2
-    unknown, error = said(None, None, None)
-    assert unknown == "Unseen frames 16–49: the error is not known." and error == float("inf")
 
 
 def first_screen(page: str) -> str:

@@ -117,21 +117,6 @@ def test_networks_of_one_object_each_are_one_row_beside_the_joint_one(tmp_path):
     assert not any("more than once" in note for note in study.notes)
 
 
-def on_object(name, rate, **data):
-    settings = config()
-    settings["optimizer"]["network_lr"] = rate
-    settings["data"].update(root=f"/data/{name}", **data)
-    return settings
-
-
-def test_a_method_whose_settings_were_chosen_for_each_object_is_one_row_and_told(tmp_path):
-    for name, rate in (("one", 0.001), ("two", 0.01)):
-        evaluate(write_run(tmp_path / name, on_object(name, rate)), make_curves(rate, name=name))
-    study = study_of(tmp_path)
-    assert [(g.label, sorted(g.objects)) for g in study.groups] == [("gausim", ["one", "two"])]
-    assert "gausim: its settings are not the same on all objects (optimizer.network_lr)." in study.notes
-
-
 def test_seeds_are_pooled_by_hand(sweep):
     study = study_of(sweep)
     cell = l2(study, "gausim", split="unseen")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers.digests import digest
+from helpers.plain import digest
 from helpers.toy_runs import Trainings, assert_same_run, killed, rows
 
 from gausim.runs.checkpoint import read_checkpoint

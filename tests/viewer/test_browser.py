@@ -1,7 +1,7 @@
 """The viewer in a real browser: the page loads, a drag moves the object where it goes, sessions replay bit for bit."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.chromium import CTRL, SHIFT, Page, chromium, needs_chromium
+from helpers.column import make_interaction
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 from viser.transforms import SO3
 
-from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Kernels
 from gausim.interaction.session import Force, Hand, Impulse, load_session, save_session
@@ -113,7 +113,7 @@ def play(viewer: Viewer, page: Page) -> None:
     assert torch.equal(interaction.frame.positions, scene.means) and not live.message
 
 
-def test_page_pulls_where_the_mouse_goes_and_resets(make_interaction, tmp_path: Path) -> None:
+def test_page_pulls_where_the_mouse_goes_and_resets(tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(), sessions=tmp_path), tmp_path) as (viewer, page):
         live = viewer.live
         centre, end, force = drag(viewer, page)
@@ -128,7 +128,7 @@ def test_page_pulls_where_the_mouse_goes_and_resets(make_interaction, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_pin_goes_where_the_mouse_goes(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+def test_a_pin_goes_where_the_mouse_goes(tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(), sessions=tmp_path), tmp_path) as (viewer, page):
         live, scene = viewer.live, viewer.live.interaction.scene
         pins = viewer.placing.to_page(scene.means)[scene.pinned]
@@ -150,13 +150,13 @@ def test_a_pin_goes_where_the_mouse_goes(make_interaction: Callable[..., Interac
 
 
 @pytest.mark.slow
-def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+def test_page_is_dragged_reset_and_replayed(tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(keep=None), sessions=tmp_path), tmp_path) as (viewer, page):
         play(viewer, page)
 
 
 @pytest.mark.slow
-def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+def test_page_brushes_flicks_and_takes_a_session(tmp_path: Path) -> None:
     interaction = make_interaction(keep=None)
     with opened(Subject("a column", interaction, sessions=tmp_path), tmp_path) as (viewer, page):
         pointer, live = viewer.pointer, viewer.live
@@ -184,7 +184,7 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
 
 
 @pytest.mark.slow
-def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+def test_page_looks_from_a_camera_of_the_data_set(tmp_path: Path) -> None:
     interaction = make_interaction()
     cameras = orbit_cameras(interaction.scene.means, azimuths=[0.0, 90.0], size=(64, 48))
     subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)

@@ -3,20 +3,19 @@
 import asyncio
 import threading
 import time
-from collections.abc import Callable
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
+from helpers.column import make_interaction
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 
 from gausim.core import ConfigError
 from gausim.interaction import interaction as interaction_module
-from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
@@ -27,7 +26,7 @@ from gausim.viewer.splats import SIZE, Placing
 
 
 @pytest.fixture
-def one(make_interaction: Callable[..., Interaction]) -> Live:
+def one() -> Live:
     return Live(make_interaction(keep=None), lambda _: None)
 
 
@@ -134,7 +133,7 @@ def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(one: L
     one.join(5)
 
 
-def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interaction]) -> None:
+def test_time_stands_while_nobody_looks() -> None:
     watched = threading.Event()
     one = Live(make_interaction(), lambda _: None, watched=watched.is_set)
     one.start()
@@ -147,7 +146,7 @@ def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interact
     one.join(5)
 
 
-def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interaction: Callable[..., Interaction]) -> None:
+def test_takes_are_played_in_their_own_time_and_cannot_be_pushed() -> None:
     interaction = make_interaction()
     trajectory = make_interaction()._dynamics.rollout(interaction.state, 5)
     one = Live(interaction, lambda _: None, takes=[Take("Predicted: a", lambda: trajectory)])
@@ -160,7 +159,7 @@ def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interactio
     assert interaction.tick == 0
 
 
-def test_a_replay_has_the_gravity_and_the_gusts_of_the_session(make_interaction) -> None:
+def test_a_replay_has_the_gravity_and_the_gusts_of_the_session() -> None:
     recorded = Live(make_interaction(gravity=2.0), lambda _: None)
     recorded.interaction.seed = 3
     recorded.begin()

@@ -2,18 +2,18 @@
 
 import threading
 import time
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from helpers.column import make_column, make_interaction
 from torch import Tensor
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
 
-from gausim.core import Frame, GaussianScene
+from gausim.core import Frame
 from gausim.interaction.interaction import Interaction
 from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
@@ -39,7 +39,7 @@ def test_rounded_covariances_stay_positive_definite_and_near(size: float, spread
         assert float((error / largest.clamp_min(1e-4)).max()) < 0.006
 
 
-def test_a_packed_kernel_reads_as_viser_writes_it(make_column: Callable[..., GaussianScene]) -> None:
+def test_a_packed_kernel_reads_as_viser_writes_it() -> None:
     scene = make_column()
     placing = Placing.of(scene)
     covars = covariance_from_scales(scene.log_scales, scene.quats)
@@ -54,7 +54,7 @@ def test_a_packed_kernel_reads_as_viser_writes_it(make_column: Callable[..., Gau
 
 
 @pytest.fixture
-def painter(make_interaction: Callable[..., Interaction]) -> tuple[Painter, Interaction]:
+def painter() -> tuple[Painter, Interaction]:
     interaction = make_interaction()
     return Painter(interaction.scene, interaction.units, interaction.masses), interaction
 

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -16,6 +17,13 @@ from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleS
 from gausim.core import ConfigError
 
 DEVIATION, CELL = 0.035, 0.05
+
+
+def lattice(lower: Sequence[float], upper: Sequence[float], spacing: float) -> Tensor:
+    """Positions of a block from one corner to the other, each in the middle of a cube of the given edge."""
+    counts = [round((b - a) / spacing) for a, b in zip(lower, upper, strict=True)]
+    axes = [a + spacing * (torch.arange(n) + 0.5) for a, n in zip(lower, counts, strict=True)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
 def sphere(radius: float, count: int = 3000) -> Tensor:
@@ -131,7 +139,7 @@ class Solver(MPMSolver):
         return 10
 
 
-def scene(lattice, device: str = "cpu") -> tuple[MPMSolver, ParticleState, Tensor]:
+def scene(device: str = "cpu") -> tuple[MPMSolver, ParticleState, Tensor]:
     """A strained, moving block, one of its sides pinned; 36 particles of different moduli."""
     generator = torch.Generator().manual_seed(0)
     x = lattice((1.1, 1.2, 1.1), (1.3, 1.35, 1.25), 1 / 20)
@@ -168,8 +176,8 @@ ADJOINT_STEPS = {
 
 
 @pytest.mark.parametrize("name", ADJOINT_STEPS)
-def test_gradients_are_difference_quotients(lattice, name: str):
-    solver, state, log_young = scene(lattice)
+def test_gradients_are_difference_quotients(name: str):
+    solver, state, log_young = scene()
     at, step = log_young if name == "log_young" else getattr(state, name), ADJOINT_STEPS[name]
 
     def function(value: Tensor) -> Tensor:
@@ -188,10 +196,10 @@ def test_gradients_are_difference_quotients(lattice, name: str):
 
 
 @pytest.mark.gpu
-def test_a_gpu_gives_the_same_states_and_gradients(lattice):
+def test_a_gpu_gives_the_same_states_and_gradients():
     results = []
     for device in ("cpu", "cuda"):
-        solver, state, log_young = scene(lattice, device)
+        solver, state, log_young = scene(device)
         leaves = [t.requires_grad_() for t in (*state.tensors(), log_young)]
         made = ParticleState(*leaves[: len(fields(state))])
         end = solver.advance(made, 0, young_modulus=leaves[-1].exp())
@@ -225,7 +233,7 @@ def momenta(state: ParticleState, mass: torch.Tensor, dx: float) -> tuple[torch.
     return linear, (m[:, None] * (torch.linalg.cross(x, v) + dx**2 / 4 * spin)).sum(0)
 
 
-def test_momenta_are_conserved_without_boundary(lattice):
+def test_momenta_are_conserved_without_boundary():
     grid = Grid(cells=16, size=1.0)
     x = lattice((0.35, 0.35, 0.4), (0.65, 0.55, 0.6), 1 / 32)
     generator = torch.Generator().manual_seed(0)
@@ -244,7 +252,7 @@ def test_momenta_are_conserved_without_boundary(lattice):
     assert (state.deformation_gradients - torch.eye(3)).abs().max() > 0.1  # it deformed a lot meanwhile
 
 
-def test_axial_period_of_a_bar_held_at_one_end(lattice):
+def test_axial_period_of_a_bar_held_at_one_end():
     """It swings with T = 4 L / c, c = sqrt(E / rho)."""
     grid = Grid(cells=32, size=1.0)
     start, held, end = 0.1875, 0.25, 0.8125  # nodes
@@ -263,7 +271,7 @@ def test_axial_period_of_a_bar_held_at_one_end(lattice):
     assert 2 * (crossings[1] - crossings[0]) == pytest.approx(period, rel=0.05)
 
 
-def test_a_frame_may_carry_particles_far_beyond_the_nodes_where_it_began(lattice):
+def test_a_frame_may_carry_particles_far_beyond_the_nodes_where_it_began():
     grid = Grid(cells=20, size=1.0)
     x = lattice((0.1, 0.4, 0.4), (0.2, 0.5, 0.5), 1 / 40)
     solver = simulation(x, grid, frame_time=0.5)
@@ -274,7 +282,7 @@ def test_a_frame_may_carry_particles_far_beyond_the_nodes_where_it_began(lattice
     assert float(v.grad[:, 0].sum()) == pytest.approx(0.5 * len(x), rel=1e-3)
 
 
-def test_substeps_keep_the_bound(lattice):
+def test_substeps_keep_the_bound():
     grid = Grid(cells=64, size=1.0)
     x = lattice((0.4, 0.4, 0.4), (0.6, 0.5, 0.5), 1 / 64)
     stiff = Material(young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
@@ -306,7 +314,7 @@ def rolled(solver, x, velocity, frames):
     return states
 
 
-def test_centre_falls_on_the_parabola(lattice):
+def test_centre_falls_on_the_parabola():
     x = lattice((0.4, 0.4, 0.6), (0.6, 0.6, 0.75), 1 / 32)
     states = rolled(above_floor(x), x, [0.1, 0.0, 0.0], 10)
     fallen = torch.stack([s.positions.mean(0) for s in states]) - x.mean(0)
@@ -315,7 +323,7 @@ def test_centre_falls_on_the_parabola(lattice):
     assert fallen[:, 2].tolist() == pytest.approx((-0.5 * GRAVITY * t**2).tolist(), rel=0.02, abs=5e-4)
 
 
-def test_block_bounces_off_the_floor_and_does_not_enter_it(lattice):
+def test_block_bounces_off_the_floor_and_does_not_enter_it():
     x = lattice((0.4, 0.4, 0.45), (0.6, 0.6, 0.6), 1 / 32)
     states = rolled(above_floor(x), x, [0.0, 0.0, 0.0], 24)
     height = torch.stack([s.positions[:, 2].mean() for s in states])
@@ -326,14 +334,14 @@ def test_block_bounces_off_the_floor_and_does_not_enter_it(lattice):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_sliding_block_is_slowed_by_friction_times_gravity(lattice, friction):
+def test_sliding_block_is_slowed_by_friction_times_gravity(friction):
     x = lattice((0.2, 0.4, FLOOR + 0.015), (0.4, 0.6, FLOOR + 0.14), 1 / 32)
     states = rolled(above_floor(x, friction), x, [0.6, 0.0, 0.0], 16)
     speed = [float(s.velocities[:, 0].mean()) for s in states]
     assert speed[16] - speed[4] == pytest.approx(-friction * GRAVITY * 0.05 * 12, rel=0.1, abs=1e-3)
 
 
-def test_loss_gradients_pass_through_the_contact(lattice):
+def test_loss_gradients_pass_through_the_contact():
     x = lattice((0.4, 0.4, FLOOR + 0.02), (0.55, 0.55, FLOOR + 0.15), 1 / 32)
     solver = above_floor(x)
 
