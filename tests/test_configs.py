@@ -204,9 +204,7 @@ def test_the_comparison_is_on_sealed_data_with_equal_trials(monkeypatch: pytest.
     "swept",
     [["plan.max_minutes=1,2", "ablation=none,no_mass"], ["data.root=a/b,a/../b,a_b"], ["data=bunny,synthetic"]],
 )
-def test_jobs_of_a_sweep_never_share_a_directory(
-    swept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jobs_of_a_sweep_never_share_a_directory(swept, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[Path] = []
 
@@ -274,9 +272,7 @@ def test_the_configurations_of_all_jobs_are_printed(capsys: pytest.CaptureFixtur
          "ablation=joint: changes nothing of this configuration, so it would repeat ablation=none."),
     ],
 )  # fmt: skip
-def test_a_wrong_command_is_one_sentence_and_leaves_nothing(
-    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_command_is_one_sentence_and_leaves_nothing(words, message, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for arguments in (words.split(), ["-m", *words.split(), "name=sweep"]):
         if "several" in message and "-m" in arguments:

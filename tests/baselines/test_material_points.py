@@ -19,12 +19,7 @@ from gausim.baselines.material_point.method import Discretisation, MaterialPoint
 from gausim.baselines.material_point.physdreamer import ModulusField, PhysDreamer
 from gausim.baselines.material_point.physgaussian import PhysGaussian
 from gausim.baselines.mpm import Filling, Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
-from gausim.core import (
-    Floor,
-    GaussianScene,
-    SimState,
-    Surroundings,
-)
+from gausim.core import Floor, GaussianScene, SimState, Surroundings
 from gausim.ops.rotation import quaternion_to_matrix
 
 TRUE = 1e5

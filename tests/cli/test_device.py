@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.random_scene import random_scene
+from helpers.plain import random_scene
 
 import gausim
 from gausim.cli import evaluate

@@ -95,9 +95,7 @@ def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["spring_mass", "deformation_field", "physdreamer"])
-def test_a_resumed_fit_equals_an_uninterrupted_one(
-    model: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_fit_equals_an_uninterrupted_one(model, arguments, monkeypatch) -> None:
     if model.startswith("phys"):
         pytest.importorskip("warp")
     asked = [f"model={model}", *SMALL[model], *arguments]
@@ -126,9 +124,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
     assert len(tables[0]) > 1 and tables[0] == tables[1]
 
 
-def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_budget_walks_through_all_stages_and_says_what_was_cut(arguments, monkeypatch) -> None:
     clock = iter(float(i) for i in range(10_000))  # every look at the clock takes a second
     monkeypatch.setattr("time.process_time", lambda: next(clock))
     long = [f"{STAGES}.velocity.iterations=40", f"{STAGES}.dynamics.iterations=40"]

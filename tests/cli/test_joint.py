@@ -43,9 +43,7 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
     assert errors[0] != errors[1] and min(errors) > 0
 
 
-def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(
-    joint: Path, other: Path, tmp_path: Path, capsys
-) -> None:
+def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(joint, other, tmp_path, capsys) -> None:
     source = weights(joint)
     shared = [name for name in source if name.startswith("model.predictor.")]
     assert {name.split(".")[2] for name in shared} == {"network", "node_normaliser", "edge_normaliser"}
@@ -61,9 +59,7 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(
 
 
 @pytest.mark.slow
-def test_a_network_that_was_taken_over_is_trained_on_after_a_cut(
-    joint: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_that_was_taken_over_is_trained_on_after_a_cut(joint, other, tmp_path, monkeypatch) -> None:
     saved = RunCheckpoint.on_train_epoch_end
 
     def crash(self: RunCheckpoint, trainer: object, pl_module: object) -> None:

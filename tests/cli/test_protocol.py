@@ -114,9 +114,7 @@ def test_declarations(toy: Path, tmp_path: Path) -> None:
         reserved_part({"seeds": "all"}, "data.test")
 
 
-def test_looks_are_declared_counted_and_said(
-    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_looks_are_declared_counted_and_said(run, capsys, monkeypatch) -> None:
     assert evaluate.main([str(run)]) == 0  # the development part
     found = json.loads((run / "evaluation" / "metrics.json").read_text())
     assert found["objects"]["toy"]["sequences"] == ["seq_000"] and found["run"]["part"] == "development"
@@ -191,9 +189,7 @@ def test_data_without_a_test_part_know_no_look(toy: Path, run: Path) -> None:
         ("development", None, "seq_001", ""),
     ],
 )
-def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(
-    part: str | None, trials: int | None, reserved: str, message: str, toy: Path
-) -> None:
+def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(part, trials, reserved, message, toy):
     names: Any = "all" if reserved == "all" else [name for name in [reserved] if name]
     data = ReadyDataModule(toy, part=part, test={"sequences": names})
     cfg = OmegaConf.create({"data": {"part": part}, "trials": trials, "evaluate": True})

@@ -14,22 +14,12 @@ from gausim.cli import simulate, train
 from gausim.compose.build import load_run
 from gausim.compose.live import ENERGY_ROOM, open_interaction
 from gausim.core import DataError
+from gausim.interaction import session as do
 from gausim.interaction import words as _force_words
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
-from gausim.interaction.session import (
-    Event,
-    Force,
-    Gravity,
-    Impulse,
-    Pin,
-    Release,
-    Unpin,
-    Wind,
-    load_session,
-    save_session,
-)
+from gausim.interaction.session import Event, Force, Impulse, load_session, save_session
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
 from gausim.ops.covariance import covariance_from_scales
@@ -124,9 +114,9 @@ def random_event(r: random.Random, live: Interaction) -> Event:
     kinds = {
         "force": Force(part, direction, size, frames=r.choice([1, 6, 40]), name=str(r.randrange(3))),
         "impulse": Impulse(part, direction, size / live.fps * (1 - 1e-9)),
-        "wind": Wind(direction, r.choice([0.0, size]), gusts=r.random()),
-        "gravity": Gravity(direction, r.choice([0.0, size])),
-        "pin": Pin(ball), "unpin": Unpin(), "release": Release(),
+        "wind": do.Wind(direction, r.choice([0.0, size]), gusts=r.random()),
+        "gravity": do.Gravity(direction, r.choice([0.0, size])),
+        "pin": do.Pin(ball), "unpin": do.Unpin(), "release": do.Release(),
     }  # fmt: skip
     return kinds[r.choice([*kinds, "force", "force"])]
 

@@ -42,9 +42,7 @@ def test_a_sweep_names_its_jobs(arguments: list[str], monkeypatch: pytest.Monkey
     assert len(list(Path().rglob("offline-run-*"))) == 4
 
 
-def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(arguments, monkeypatch) -> None:
     step, clip = GausSimModule.training_step, panels._clip
 
     def careless_step(self: GausSimModule, *args: object) -> None:
@@ -71,9 +69,7 @@ def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(
     assert len(list(read_video(run / "panels" / "step_000002" / "toy_seq_000.mp4"))) == 3  # frames 0..t_max
 
 
-def test_a_panel_that_cannot_be_drawn_is_left_out(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_panel_that_cannot_be_drawn_is_left_out(arguments, monkeypatch, capsys) -> None:
     def explode(self: GausSimModule, sample: object) -> torch.Tensor:
         return torch.full((3, 1, 32, 32, 3), torch.nan)
 

@@ -47,9 +47,7 @@ def again(arguments: list[str], finished: Path, tmp_path: Path) -> list[str]:
     return [*arguments, "plan.epochs=1"]
 
 
-def test_motion_and_data_are_looked_at_and_training_does_not_notice(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_motion_and_data_are_looked_at_and_training_does_not_notice(arguments, capsys) -> None:
     shown = ["trainer.motion_epochs=1", "logger=default", "doctor=true", "trainer.panel_epochs=1"]
     assert command.main([*[x for x in arguments if x not in ("logger=none", "trainer.panel_epochs=0")], *shown]) == 0
     made = {"config.yaml", "FINISHED", "last.ckpt", "epochs.csv", "motion.csv", "panels", "tensorboard", "csv"}

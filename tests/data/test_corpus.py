@@ -46,7 +46,6 @@ def truncated(root: Path) -> None:
     [
         (changed("rest", lambda x: None), rf"{SHARD}: tensor '{NAME}.rest' is missing"),
         (changed("rest", lambda x: x[:-1]), rf"{NAME}.rest' is torch.float32 \(80, 3\), expected .* \(81, 3\)"),
-        (changed("displacement", lambda x: x.float()), r"displacement' is torch.float32 .*expected torch.float16"),
         (changed("displacement", lambda x: x * torch.inf), "displacement' has values that are no finite"),
         (changed("stiffness", lambda x: -x), "stiffness' has values that are not positive"),
         (truncated, rf"{SHARD}: cannot be read as safetensors"),
@@ -64,8 +63,6 @@ def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None]
     ("key", "value", "message"),
     [
         ("schema", "gausim.corpus/9", "field 'schema' is 'gausim.corpus/9', expected"),
-        ("seed", "none", "field 'seed': expected"),
-        ("bodies", [{"name": "a"}], "bodies"),
         ("bodies", [], "bodies"),
     ],
 )

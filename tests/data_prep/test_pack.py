@@ -84,7 +84,6 @@ def _header(change: Callable[[dict], object]) -> Callable[[Path], object]:
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "pixels cut": (lambda s: _cut(s / "sequences/seq_001/view_1.npy"), "seq_001", "view_1.npy: cannot be read"),
-    "schema": (_header(lambda d: d.update(schema=9)), "seq_000", "schema"),
     "nan": (_header(lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
     "corner": (_header(lambda d: d["views"][0].update(left=30)), "seq_000", "expected 9 frames inside"),
     "frames": (
@@ -92,8 +91,6 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
         "seq_000",
         "got 8",
     ),
-    "objects": (lambda s: np.save(s / "sequences/seq_000/view_0.npy", np.array([None])), "seq_000", "cannot be read"),
-    "focal": (_header(lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)), "seq_000", "focal"),
     "fps": (_header(lambda d: d.update(fps=25)), "seq_000", "fps"),
     "view": (_header(lambda d: d["views"][0].update(name="cam_9")), "seq_000", "cam_9"),
     "facts": (lambda s: edit_json(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),

@@ -114,29 +114,6 @@ def write_masks(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def test_every_way_to_write_a_mask_is_read(tmp_path: Path) -> None:
-    for name, path in write_masks(tmp_path).items():
-        mask = read_mask(path, (24, 16), "a")
-        wrong = np.abs(mask.astype(int) - 255 * DISC)
-        assert mask.dtype == np.uint8 and (
-            wrong.max() == 0 or (name == "ringing.jpg" and (wrong > 40).mean() < 0.05)
-        ), name
-
-
-def test_masks_that_are_none_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "m.png"
-    for values, told in (
-        (7 * DISC, "labels of several"),
-        (100 * DISC, "half transparent"),
-        (255 * DISC[:4], "is 24x4"),
-    ):
-        cv2.imwrite(str(path), values.astype(np.uint8))
-        with pytest.raises(DataError, match=rf"m\.png: .*{told}"):
-            read_mask(path, (24, 16), "a")
-    cv2.imwrite(str(path), np.zeros(DISC.shape, np.uint8))
-    assert not read_mask(path, (24, 16), "a").any()  # the object is out of the picture
-
-
 def test_the_reference_says_what_becomes_of_every_mask(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/reference/data-set.md").read_text()
     table = page[page.index("## Masks") : page.index("## scene.ply and its masks")]
@@ -147,7 +124,7 @@ def test_the_reference_says_what_becomes_of_every_mask(tmp_path: Path) -> None:
         "picture with alpha": ["alpha.png", "grey alpha.tif"],
         "grey, colour, 16 bit, palette of greys": ["values.png", "opaque.png", "deep.png", "greys.png"],
         "values 0 and 1, or one bit": ["labels.png", "deep labels.png", "bit.png", "bit.tif"],
-        "palette of colours": ["palette.png", "palette.tif", "two bits.png"],
+        "palette of colours": ["palette.png", "palette.tif", "palette.gif", "two bits.png"],
         "JPEG": ["ringing.jpg"],
     }
     refused = {"largest value 2 to 127; another size": (2 * DISC, 31 * DISC, 32 * DISC, 127 * DISC, 255 * DISC[:4])}
@@ -156,10 +133,13 @@ def test_the_reference_says_what_becomes_of_every_mask(tmp_path: Path) -> None:
         assert "refused" not in rows[kind]
         for name in names:
             mask = read_mask(read[name], (24, 16), "a")
-            assert (mask[DISC] > 127).mean() > 0.9 and (mask[~DISC] < 128).mean() > 0.9, name
+            wrong = abs(mask.astype(int) - 255 * DISC)
+            assert (wrong > 40).mean() < 0.05 if name == "ringing.jpg" else wrong.max() == 0, name
     for kind, masks in refused.items():
         assert rows[kind].startswith("refused")
         for values in masks:
             cv2.imwrite(str(tmp_path / "no.png"), values.astype(np.uint8))
             with pytest.raises(DataError, match=r"no\.png: "):
                 read_mask(tmp_path / "no.png", (24, 16), "a")
+    cv2.imwrite(str(tmp_path / "none.png"), np.zeros(DISC.shape, np.uint8))
+    assert not read_mask(tmp_path / "none.png", (24, 16), "a").any()  # the object is out of the picture

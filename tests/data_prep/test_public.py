@@ -53,21 +53,14 @@ def check_views(data: ObjectData, sample: Sample, tolerance: float) -> None:
             assert np.abs(pixels[frame, view][both].astype(float) - truth[both]).mean() < tolerance
 
 
-FALLS = [("springgaus", {}, 1 / 0.03, [0, -9.8, 0], ([0, 0.3, 0], [0, 1, 0]), 1.0)]
-
-
-@pytest.mark.parametrize(("kind", "options", "fps", "gravity", "floor", "tolerance"), FALLS, ids=lambda v: str(v)[:10])
-def test_falls_keep_their_world(
-    kind: str, options: dict, fps: float, gravity: list, floor: tuple, tolerance: float, sample_of: SampleOf,
-    tmp_path: Path,
-) -> None:  # fmt: skip
-    sample = sample_of(kind)
-    data, results = imported(kind, sample.root, tmp_path / "out", **options)
+def test_a_fall_keeps_its_world(sample_of: SampleOf, tmp_path: Path) -> None:
+    sample = sample_of("springgaus")
+    data, results = imported("springgaus", sample.root, tmp_path / "out")
     assert verify(tmp_path / "out") == [] and results["without_alpha"] == [] and data.name == sample.root.name
-    assert data.fps == pytest.approx(fps) and data.train_frames == range(FRAMES) and data.heldout_views == ()
-    assert data.facts["gravity"] == gravity and data.facts["free"] is True
-    assert (data.facts["floor"]["point"], data.facts["floor"]["normal"]) == floor
-    check_views(data, sample, tolerance)
+    assert data.fps == pytest.approx(1 / 0.03) and data.train_frames == range(FRAMES) and data.heldout_views == ()
+    assert data.facts["gravity"] == [0, -9.8, 0] and data.facts["free"] is True
+    assert (data.facts["floor"]["point"], data.facts["floor"]["normal"]) == ([0, 0.3, 0], [0, 1, 0])
+    check_views(data, sample, 1.0)
     np.testing.assert_array_equal(data.stills().images[1], data.sequences[0].frames(range(1))[0, 1])
 
 
@@ -189,41 +182,28 @@ def narrow(pixels: np.ndarray) -> np.ndarray:
 DAMAGE: list[tuple[str, str, Callable[[Any], Any] | None, str]] = [
     ("springgaus", "camera.json", put(1, "c2w", 0, 0, to=5.0), "rotation"),
     ("springgaus", "camera.json", put(1, "K", 1, 1, to=0.0), "fx"),
-    ("springgaus", "camera.json", put(1, "camera", to="../x"), "name of letters"),
-    ("springgaus", "camera.json", lambda data: {}, "expected"),
     ("springgaus", "frame.json", put(3, to={"t": 0.5}), "equal steps"),
     ("springgaus", "camera_1/003.png", None, "frame 3 is missing"),
     ("springgaus", "camera_1/003.png", narrow, "is for 48x48"),
     ("pacnerf", "all_data.json", put(3, "file_path", to="../r_0_3.png"), "inside"),
     ("pacnerf", "all_data.json", put(3, "c2w", 0, 3, to=9.0), "stands still"),
-    ("pacnerf", "data/r_0_3.png", None, "r_0_3.png"),
-    ("phystwin", "metadata.json", put("frame_num", to=9), "field 'frame_num' is 9"),
     ("phystwin", "calibrate.pkl", lambda data: data[:2], "list of 3 poses"),
     ("phystwin", "calibrate.pkl", put(0, to=Call(os.mkdir, "canary")), "posix.mkdir"),
     ("phystwin", "final_data.pkl", put("controller_points", to=np.full((FRAMES, 12, 3), np.nan)), "controller_points"),
     ("phystwin", "split.json", put("test", to=[4, FRAMES]), "'train' [0, n]"),
     ("phystwin", "mask/mask_info_1.json", put("7", to="bear"), "expected one mask"),
-    ("phystwin", "mask/0/1/0.png", narrow, "the mask of 0.png"),
     ("physdreamer", "sparse/0/images.bin", lambda data: data[:-9], "truncated"),
     ("physdreamer", "images/frame_00003.png", narrow, "another shape"),
-    ("physdreamer", "point_cloud.ply", lambda data: data[:200], ""),
     ("physdreamer", "videos/frame_00002_poke.mp4", lambda data: data[:300], ""),
     ("ready", "meta.json", put("train", to=["00003"]), "share"),
-    ("ready", "meta.json", put("train", to=[{}]), "train"),
     ("ready", "video_masks/seq_00001_cam_00001/1.png", None, "no mask of"),
-    ("ready", "images/still_a.png", None, "no such file"),
 ]
 
 
 @pytest.mark.parametrize(("kind", "file", "change", "told"), DAMAGE, ids=lambda v: v if isinstance(v, str) else "")
-def test_damaged_files_are_refused(
-    kind: str, file: str, change: Callable[[Any], Any] | None, told: str, sample_of: SampleOf, tmp_path: Path
-) -> None:
+def test_damaged_files_are_refused(kind, file, change, told, sample_of, tmp_path) -> None:
     root = sample_of(kind).root
-    path, options = (
-        root / file,
-        {"fps": 25.0} if kind == "genesis" else {"anchor": 0.4} if kind == "physdreamer" else {},
-    )
+    path, options = root / file, {"anchor": 0.4} if kind == "physdreamer" else {}
     good = path.read_bytes()
     try:
         if change is None:
@@ -269,9 +249,7 @@ HOSTILE: dict[str, Any] = {
 
 @pytest.mark.parametrize("protocol", [0, 2, 5])
 @pytest.mark.parametrize("told", HOSTILE)
-def test_nothing_else_in_a_pickle_is_read_or_executed(
-    told: str, protocol: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_else_in_a_pickle_is_read_or_executed(told, protocol, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "hostile.pkl"
     path.write_bytes(pickle.dumps(HOSTILE[told], protocol=protocol))

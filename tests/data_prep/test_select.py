@@ -89,9 +89,7 @@ def test_the_stage_writes_masks_and_a_picture(scene: Path, tmp_path: Path, capsy
     assert greener.sum() > redder.sum() > 0 and (abs(rows[1][..., 0] - rows[1][..., 1]) < 8).any()
 
 
-def test_selections_that_hold_nothing_are_refused(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_selections_that_hold_nothing_are_refused(scene, tmp_path, capsys) -> None:
     assert main([str(scene), "--pinned", "below z=-9", "--out", str(tmp_path / "out")]) == 2
     assert "mask 'pinned'" in capsys.readouterr().err and not (tmp_path / "out").exists()
     with pytest.raises(ConfigError, match="no mask"):

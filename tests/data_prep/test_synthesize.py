@@ -22,7 +22,6 @@ from gausim.data.images import composite
 from gausim.ops.visual_hull import project
 from gausim.render.draw import draw_still
 from gausim.render.reference import ReferenceRenderer
-from gausim.training.plan import TrainingPlan
 
 TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
 PUSHED = ("flower", "potted", "pudding")
@@ -47,15 +46,6 @@ def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> N
     assert first == again and len(first) > 100
     motion = "sequences/seq_000/ground_truth.npz"
     assert first[motion] != other[motion] and first["scene.ply"] != other["scene.ply"]
-
-
-def test_set_is_read_by_the_data_module(made: Path) -> None:
-    data = ReadyDataModule(made, plan=TrainingPlan(t_start=1, t_max=5, batch_size=4, repeats=1))
-    data.setup("fit")
-    (batch,) = list(data.train_dataloader())
-    assert sorted(s.object_name for s in batch) == ["flower_soft"] * 2 + ["pudding_soft"] * 2
-    assert all(s.frames.shape == (2, 4, 24, 24, 4) for s in batch)
-    assert all(o.stills().images.shape == (10, 64, 64, 4) for o in data.objects)
 
 
 def test_first_frame_is_the_rest_scene_as_the_oracle_draws_it(made: Path) -> None:

@@ -85,9 +85,7 @@ def found(entry: dict) -> dict[str, dict]:
     return {f["check"]: f for f in reversed(entry["findings"]) if f["severity"] != "note"}
 
 
-def test_a_good_object_has_no_fault_and_no_warning_and_two_pictures(
-    swaying: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_good_object_has_no_fault_and_no_warning_and_two_pictures(swaying, tmp_path, capsys) -> None:
     out = tmp_path / "seen"
     status, entry = told(swaying, capsys, "--out", str(out))
     assert status == 0 and not entry["ruinous"] and not entry["faults"] and not entry["left_out"]

@@ -13,7 +13,7 @@ from gausim.models.template.finite_strain import FiniteStrain
 from gausim.models.template.material import Damping, Links, MaterialTemplate
 from gausim.models.template.solid import SolidSettings
 from gausim.models.template.springs import Springs
-from helpers.random_scene import FIELDS
+from helpers.plain import FIELDS
 from helpers.simulators import gausim
 
 # The settings of `model=gausim`, small.

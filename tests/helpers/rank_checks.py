@@ -6,9 +6,8 @@ import signal
 import sys
 import tempfile
 import traceback
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import timedelta
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,48 +17,29 @@ from gausim.core import DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.metrics.image import PSNR
-from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
-from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
-from helpers import toy_object
+from helpers import sway, toy_object
 from helpers.plain import digest
-from helpers.simulators import gausim
 
 SCENES = (0, 0, 1, 0, 1, 1)  # of sequences 0 to 5; the last is in no batch
 AMPLITUDES = (0.4, -0.25, 0.3, -0.35, 0.2, 0.1)
 
 
-def cast(record: Any, dtype: torch.dtype) -> Any:
-    """A scene or cameras in another type."""
-    floats = {f.name: getattr(record, f.name) for f in fields(record)}
-    return replace(
-        record, **{n: v.to(dtype) for n, v in floats.items() if torch.is_tensor(v) and v.is_floating_point()}
-    )
-
-
 def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSettings) -> GausSimModule:
-    torch.manual_seed(0)
-    scenes = [cast(toy_object.toy_scene(), dtype) for _ in range(2)]
-    model = gausim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), output_scale=0.02)
-    module = GausSimModule(
-        method=SharedSimulator(model, FreeInitialStates(model, SCENES), SCENES),
-        renderer=ReferenceRenderer(),
-        objective=objective,
-        optimizer=settings,
-    )
-    return module.to(dtype)
+    parts = {"renderer": ReferenceRenderer(), "objective": objective, "optimizer": settings}
+    return sway.real_module(SCENES, parts=parts, dtype=dtype, output_scale=0.02)
 
 
 def samples(count: int, steps: int, dtype: torch.dtype) -> list[SequenceSample]:
-    made, cameras = [], toy_object.cameras().select([0])
+    """Of one view."""
+    made, cameras = [], sway.cast(toy_object.cameras().select([0]), dtype)
     for number in range(count):
-        toy = toy_object.ToyObject(Path("unused"), toy_object.toy_scene(), amplitudes={"a": AMPLITUDES[number]})
-        frames = toy_object.rgba(toy.scene, toy.truth("a", steps + 1))[:, :1]
-        seen = cast(cameras, dtype)
-        made.append(SequenceSample(SCENES[number], "toy", number, f"seq_{number}", frames, seen, 24.0))
+        whole = sway.sample(0, steps, AMPLITUDES[number])
+        own = {"scene_id": SCENES[number], "sequence_id": number, "sequence_name": f"seq_{number}"}
+        made.append(replace(whole, frames=whole.frames[:, :1], cameras=cameras, **own))
     return made
 
 

@@ -1,6 +1,7 @@
 """The smallest simulator that can be trained, on the toy object: what tests of training share."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -110,6 +111,12 @@ def blobs(means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, view
     return Rendered(rgb, rgb.amax(-1))
 
 
+def cast(record: Any, dtype: torch.dtype) -> Any:
+    """A scene or cameras in another type."""
+    floats = {n: v.to(dtype) for n, v in vars(record).items() if torch.is_tensor(v) and v.is_floating_point()}
+    return replace(record, **floats)
+
+
 ELASTIC = partial(ElasticTemplate, modes=6, neighbours=6)
 
 
@@ -118,11 +125,12 @@ def real_module(
     *,
     states: Callable[..., nn.Module] = FreeInitialStates,
     parts: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float32,
     **options: Any,
 ) -> GausSimModule:
     """A small simulator of toy scenes to be trained; ``options`` are the simulator's, ``parts`` the module's."""
     torch.manual_seed(0)
-    scenes = [toy_object.toy_scene() for _ in range(max(scene_of_sequence) + 1)]
+    scenes = [cast(toy_object.toy_scene(), dtype) for _ in range(max(scene_of_sequence) + 1)]
     model = gausim(scenes, [24.0] * len(scenes), **{"radii": (0.3, 0.7), "hidden": 8, "layers": 1, **options})
     method = SharedSimulator(model, states(model, scene_of_sequence), scene_of_sequence)
-    return GausSimModule(method=method, **{"renderer": CpuRenderer(threads=1), **(parts or {})})
+    return GausSimModule(method=method, **{"renderer": CpuRenderer(threads=1), **(parts or {})}).to(dtype)

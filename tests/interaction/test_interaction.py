@@ -9,23 +9,12 @@ from helpers.column import make_column, make_interaction, make_simulator, steps
 from msgspec.structs import replace as changed
 
 from gausim.core import ConfigError, DataError, DivergenceError, Frame, HandPath, SimState, Steppable, Stepper
+from gausim.interaction import session as do
 from gausim.interaction.hands import MovedHands
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
-from gausim.interaction.session import (
-    Force,
-    Gravity,
-    Hand,
-    Impulse,
-    MadeWith,
-    Material,
-    Pin,
-    Release,
-    Reset,
-    Unpin,
-    Wind,
-)
+from gausim.interaction.session import Force, Gravity, Hand, Impulse, Pin, Release, Reset, Unpin, Wind
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.ops.rotation import rotation_of
 
@@ -138,7 +127,7 @@ def test_a_force_is_a_multiple_of_the_weight() -> None:
 
     masses = torch.linspace(0.5, 2, scene.count)
     initial = SimState(scene.means, scene.means)
-    made = MadeWith.of(scene, None, initial)
+    made = do.MadeWith.of(scene, None, initial)
     live = Interaction(scene, Free(initial), masses, initial, made_with=made, gravity=2.0)
     free = scene.simulated & ~scene.pinned
     dt = 1 / 24
@@ -219,7 +208,7 @@ def test_what_cannot_be_done_is_refused_and_not_recorded() -> None:
         (Force(Unit(3, 0), X, 1.0), "level 3: 'column' has levels 0 to 2"),
         (Force(Unit(1, 999), X, 1.0), "unit 999: level 1 of 'column' has units 0 to"),
         (Force(Ball((9.0, 9.0, 9.0), 0.1), X, 1.0), "no kernel of 'column' lies within 0.1 diagonals"),
-        (Material(2.0), "its material cannot be set. Take a run of model=gausim"),
+        (do.Material(2.0), "its material cannot be set. Take a run of model=gausim"),
     ):
         with pytest.raises(ConfigError, match=message):
             live.act(event)
@@ -317,17 +306,6 @@ def test_pins_go_where_the_hand_goes_and_the_body_follows() -> None:
     interaction.act(Hand(to=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.3), frames=20))
     frame = steps(interaction, 25)
     assert (frame.positions - scene.means)[free].norm(dim=1).max() > 0.02
-
-
-def test_a_session_with_a_hand_is_replayed_bit_for_bit() -> None:
-    interaction = make_interaction()
-    interaction.act(Force(Whole(), (1.0, 0.0, 0.0), 0.5, name="pull"))
-    for number in range(12):
-        if number == 4:
-            interaction.act(Hand(to=TO, frames=5))
-        interaction.step()
-    session, last = interaction.session(), interaction.frame.positions
-    assert torch.equal(replay(make_interaction(), session).positions[-1], last)
 
 
 def _nodding(frames: int = 8) -> HandPath:

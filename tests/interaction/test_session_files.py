@@ -6,38 +6,24 @@ from pathlib import Path
 import pytest
 
 from gausim.core import DataError
+from gausim.interaction import session as do
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
-from gausim.interaction.session import (
-    Entry,
-    Force,
-    ForceSession,
-    Gravity,
-    Impulse,
-    MadeWith,
-    Pin,
-    Release,
-    Reset,
-    Unpin,
-    Wind,
-    load_session,
-    parse_session,
-    save_session,
-)
+from gausim.interaction.session import load_session, parse_session, save_session
 
-MADE = MadeWith("cup", "a1", "b2", "c3", "seq_000", "demo/seed_0")
+MADE = do.MadeWith("cup", "a1", "b2", "c3", "seq_000", "demo/seed_0")
 ENTRIES = (
-    Entry(0, Force(Unit(1, 7), (0.1, 1 / 3, -2e-7), 0.30000000000000004, frames=12, name="drag")),
-    Entry(0, Force(Kernels((9, 3, 4, 5, 3, 100)), (1, 0, 0), 2)),
-    Entry(3, Impulse(Ball((0.1, 0.2, -0.3), 0.05), (0.0, 0.0, 1.0), 0.2)),
-    Entry(3, Wind((1.0, 1.0, 0.0), 0.5, gusts=0.25)),
-    Entry(4, Gravity((0.0, 0.0, -1.0), 1.0)),
-    Entry(5, Pin(Whole())),
-    Entry(8, Unpin()),
-    Entry(8, Release("drag")),
-    Entry(9, Release()),
-    Entry(20, Reset()),
+    do.Entry(0, do.Force(Unit(1, 7), (0.1, 1 / 3, -2e-7), 0.30000000000000004, frames=12, name="drag")),
+    do.Entry(0, do.Force(Kernels((9, 3, 4, 5, 3, 100)), (1, 0, 0), 2)),
+    do.Entry(3, do.Impulse(Ball((0.1, 0.2, -0.3), 0.05), (0.0, 0.0, 1.0), 0.2)),
+    do.Entry(3, do.Wind((1.0, 1.0, 0.0), 0.5, gusts=0.25)),
+    do.Entry(4, do.Gravity((0.0, 0.0, -1.0), 1.0)),
+    do.Entry(5, do.Pin(Whole())),
+    do.Entry(8, do.Unpin()),
+    do.Entry(8, do.Release("drag")),
+    do.Entry(9, do.Release()),
+    do.Entry(20, do.Reset()),
 )
-SESSION = ForceSession(MADE, 23.976, 20, ENTRIES, 9.81, seed=4)
+SESSION = do.ForceSession(MADE, 23.976, 20, ENTRIES, 9.81, seed=4)
 
 
 def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
@@ -47,7 +33,7 @@ def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
     text = (tmp_path / "a" / "s.json").read_text()
     assert len(text.splitlines()) == 10 + len(ENTRIES)  # one event a line
     assert '"kernels": "3-5, 9, 100"' in text and '"frames": 12' in text
-    empty = ForceSession(MADE, 24.0, 0, (), 9.81)
+    empty = do.ForceSession(MADE, 24.0, 0, (), 9.81)
     save_session(empty, tmp_path / "e.json")
     assert load_session(tmp_path / "e.json") == empty
 
@@ -74,15 +60,11 @@ def put(*path_and_value):
     ("change", "message"),
     [
         (put("format", "gausim.session/9"), "field 'format': expected 'gausim.session/1', got 'gausim.session/9'"),
-        (put("fps", 0), "field 'fps': expected float > 0.0, got '0'"),
         (put("steps", 10), "event 9: field 'at': expected 9 to 10, got 20"),
-        (lambda v: v.pop("steps"), "forcesession: Missing required argument .steps."),
         (put("made_with", "host", "x"), "madewith: Unexpected keyword argument .host."),
         (put("events", 4, "at", 2), "event 4: field 'at': expected 3 to 20, got 2"),
         (put("events", 0, "do", "explode"), "event 0: field 'do': expected one of force, release"),
         (put("events", 0, "direction", [0, 0, 0]), "event 0: field 'direction': expected a vector that is not zero"),
-        (put("events", 0, "weights", -1), "event 0: field 'weights': expected float >= 0.0, got '-1'"),
-        (put("events", 0, "on", {"level": 1}), "event 0: field 'on': expected"),
         (put("events", 0, "on", {"level": 1, "unit": -2}), "event 0: field 'index': expected int >= 0"),
         (put("events", 1, "on", {"kernels": "0-999999999"}), "event 1: field 'kernels': .*at most 10000000 kernels"),
     ],

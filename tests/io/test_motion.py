@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.unit_motions import unit_motion, unit_scene
+from helpers.plain import unit_motion, unit_scene
 
 from gausim.core import DataError, DivergenceError, GaussianScene, Trajectory
 from gausim.io.player import save_player

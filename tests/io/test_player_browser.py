@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.chromium import Page, chromium, needs_chromium
-from helpers.unit_motions import unit_motion, unit_scene
+from helpers.plain import unit_motion, unit_scene
 from PIL import Image
 
 from gausim.io.player import save_player

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.random_scene import FIELDS, random_scene
+from helpers.plain import FIELDS, random_scene
 
 from gausim.core import DataError
 from gausim.io.ply import load_scene

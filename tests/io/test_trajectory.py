@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import torch
-from helpers.unit_motions import unit_motion, unit_scene
+from helpers.plain import unit_motion, unit_scene
 
 from gausim.core import Trajectory
 from gausim.io.trajectory import load_trajectory, save_trajectory

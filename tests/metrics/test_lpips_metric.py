@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.plain import Call
-from helpers.waves import pair
+from helpers.plain import Call, pair
 from safetensors.torch import load_file, save_file
 
 from data_prep.common.lpips_weights import PUBLISHED, convert, digest, holds_published

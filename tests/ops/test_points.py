@@ -12,14 +12,8 @@ from scipy.spatial.distance import pdist
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
 from gausim.ops.clustering import ball_clusters, k_means
-from gausim.ops.neighbours import (
-    batched_radius_edges,
-    coded_edges,
-    neighbour_codes,
-    no_edge,
-    radius_edges,
-)
-from gausim.ops.selection import HalfSpace, NearPoints, apply_masks, parse_half_space, require_pinned
+from gausim.ops.neighbours import batched_radius_edges, coded_edges, neighbour_codes, no_edge, radius_edges
+from gausim.ops.selection import HalfSpace, apply_masks, parse_half_space, require_pinned
 
 
 def _count(labels: np.ndarray) -> int:
@@ -202,19 +196,6 @@ def test_half_spaces(scene: GaussianScene) -> None:
     assert selected(HalfSpace(2, below=0.5, above=0.1)(scene)) == [1, 2]
     assert selected(parse_half_space("y=1.5")(scene)) == [0, 1]
     assert selected(parse_half_space(" above  y = 1.5 ")(scene)) == [2, 3]
-
-
-def test_near_points(scene: GaussianScene) -> None:
-    points = torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.45]])
-    assert selected(NearPoints(points, 0.1)(scene)) == [2]
-    assert selected(NearPoints(points, 0.21)(scene)) == [1, 2]
-
-
-def test_combinations(scene: GaussianScene) -> None:
-    low, left = HalfSpace(2, below=0.3), HalfSpace(0, below=0.5)
-    assert selected((low & left)(scene)) == [0]
-    assert selected((low | left)(scene)) == [0, 1, 2]
-    assert selected((~low)(scene)) == [2, 3]
 
 
 def test_masks_are_applied_and_pins_stay_within_the_simulated(scene: GaussianScene) -> None:

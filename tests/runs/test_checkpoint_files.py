@@ -10,13 +10,7 @@ import torch
 from torch import nn
 
 from gausim.core import GaussianScene, RunError
-from gausim.runs.checkpoint import (
-    AtomicCheckpointIO,
-    check_scenes,
-    fingerprints,
-    load_weights,
-    read_checkpoint,
-)
+from gausim.runs.checkpoint import AtomicCheckpointIO, check_scenes, fingerprints, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
 
 
@@ -50,9 +44,7 @@ def test_written_and_read_without_running_code(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.open", "pathlib.Path.open"])
-def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
-    failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(failing, tmp_path, monkeypatch) -> None:
     path = tmp_path / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
     with monkeypatch.context() as patch:
@@ -65,9 +57,7 @@ def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(
-    links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(links, tmp_path, monkeypatch) -> None:
     if not links:
         monkeypatch.setattr(os, "link", _no_space)
     for value in (1.0, 2.0, 3.0):
@@ -77,9 +67,7 @@ def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(
     assert kept == {"last.ckpt": 3.0, "last.previous.ckpt": 2.0, "epoch_0001.ckpt": 3.0}
 
 
-def test_what_is_damaged_on_its_way_or_needs_code_to_read_is_not_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_damaged_on_its_way_or_needs_code_to_read_is_not_kept(tmp_path, monkeypatch) -> None:
     path = tmp_path / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
     with pytest.raises(RunError, match="could not be written .*nothing in it was executed"):

@@ -25,9 +25,7 @@ def whole(trainings: Trainings) -> Path:
 
 
 @pytest.mark.slow
-def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_the_same_bits(
-    trainings: Trainings, whole: Path
-) -> None:
+def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_the_same_bits(trainings, whole) -> None:
     settings = (*TWO, "plan.epochs=3", "trainer.checkpoint_steps=2")
     began = time.monotonic()
     status, output = trainings("rank_cut", *settings, **killed(STEP, 6, rank=1))

@@ -1,6 +1,5 @@
 """The training plan: what it decides for every recipe, and that a saved configuration states what ran."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -43,9 +42,7 @@ def cosine(part: float) -> float:
         (["model=gausim_paper"], HELD, 25, {0: 1, 14: 15, 24: 15}, {0: 1, 15: 1, 16: 0.5, 18: 0.25, 24: 0.03125}),
     ],
 )
-def test_t_and_rates_of_every_recipe(
-    overrides: list[str], data: DataFacts, epochs: int, steps: dict[int, int], factors: dict[int, float]
-) -> None:
+def test_t_and_rates_of_every_recipe(overrides, data, epochs, steps, factors) -> None:
     plan: TrainingPlan = instantiate(compose(overrides).plan).resolved(data)
     found = course(plan)
     for epoch, (t, rates) in enumerate(found):
@@ -62,9 +59,7 @@ def test_t_and_rates_of_every_recipe(
 @pytest.mark.parametrize(
     ("frames", "largest", "first"), [(3, 2, [2, 2]), (16, 15, [2, 3, 4]), (42, 41, [2, 5, 8]), (200, 60, [2, 7])]
 )
-def test_t_grows_to_the_seen_frames_of_longer_videos_in_as_many_epochs(
-    frames: int, largest: int, first: list[int]
-) -> None:
+def test_t_grows_to_the_seen_frames_of_longer_videos_in_as_many_epochs(frames, largest, first) -> None:
     plan = TrainingPlan().resolved(DataFacts(3, frames, can_warm_start=False))
     assert plan.t_max == largest == plan.steps(13) and [plan.steps(e) for e in range(len(first))] == first
 
@@ -104,9 +99,7 @@ def test_schedules() -> None:
 
 
 @pytest.mark.parametrize("start", [["plan.warm_start.updates=5"], ["plan.warm_start=null"]])
-def test_a_saved_configuration_states_what_ran(
-    start: list[str], toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_saved_configuration_states_what_ran(start, toy, tmp_path, monkeypatch) -> None:
     ran: list[tuple[int, float, dict[str, float]]] = []
     step = GausSimModule.training_step
 

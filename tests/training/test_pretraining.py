@@ -103,9 +103,7 @@ def base(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(
-    corpus: Path, base: Path, tmp_path: Path, capsys
-) -> None:
+def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus, base, tmp_path, capsys) -> None:
     _, data = pretraining(corpus)
     body = data.objects[0].scene()
     periods = {}

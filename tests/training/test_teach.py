@@ -4,15 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from helpers.simulators import SMALLEST
 from helpers.toy_object import ToyObject, toy_scene, write_object
 
-from gausim.cli import train
 from gausim.compose.build import build
 from gausim.compose.config import compose
 from gausim.core import ConfigError
-from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.plan import DataFacts, Teaching, TrainingPlan
 from gausim.training.stages import begin
 from gausim.training.teach import Lesson
@@ -20,7 +17,7 @@ from gausim.training.tracking import Track, track
 
 QUICK = [
     *SMALLEST, "render=cpu", "logger=none", "trainer.motion_epochs=0", "evaluate=false", "model=gausim_network",
-"plan.repeats=1", "plan.batch_size=1",
+    "plan.repeats=1", "plan.batch_size=1",
 ]  # fmt: skip
 
 
@@ -49,32 +46,6 @@ def test_a_network_that_is_taught_an_oscillator_has_learned_its_flow(toy: Path) 
     begin(module, data, module.plan, seed=0, quiet=True)
     module.model.eval()
     assert left() < 0.1 * untaught
-
-
-def test_a_resumed_run_goes_on_bitwise_and_its_configuration_states_the_stages(
-    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    common = [f"data.root={toy}", *QUICK, "plan.teach.shows=2", "plan.teach.rolls=2", "plan.epochs=2"]
-    assert train.main([*common, f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
-    printed = capsys.readouterr().out
-    assert [text in printed for text in ("  track: 2 sequences", "  teach: ", "  roll: ")] == [True] * 3
-    assert "warm start" not in printed
-    stated = yaml.safe_load((tmp_path / "whole/config.yaml").read_text())["plan"]
-    assert (stated["teach"]["shows"], stated["teach"]["rolls"], stated["warm_start"]) == (2, 2, None)
-    cut = f"hydra.run.dir={tmp_path / 'cut'}"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gausim.training.module.GausSimModule.on_train_epoch_end", _interrupt)
-        with pytest.raises(RuntimeError, match="cut"):
-            train.main([*common, "trainer.checkpoint_steps=1", cut])
-    capsys.readouterr()
-    assert train.main([*common, "trainer.checkpoint_steps=1", cut]) == 0
-    assert "  teach: " not in capsys.readouterr().out
-    whole, again = (read_checkpoint(tmp_path / n / "last.ckpt")["state_dict"] for n in ("whole", "cut"))
-    assert all(torch.equal(value, again[name]) for name, value in whole.items())
-
-
-def _interrupt(module: object) -> None:
-    raise RuntimeError("cut")
 
 
 def test_the_plan_leaves_teaching_out_where_motion_cannot_be_tracked() -> None:

@@ -74,9 +74,7 @@ def _film(state: Sequence[Tensor], unit_of_kernel: Tensor) -> SequenceSample:
     return replace(sway.sample(0, FRAMES - 1), frames=rgba)
 
 
-def test_motion_of_several_modes_is_found_in_the_images(
-    model: GausSim, sources: Sources, filmed: SequenceSample, coordinates: Tensor
-) -> None:
+def test_motion_of_several_modes_is_found_in_the_images(model, sources, filmed, coordinates) -> None:
     found = MotionTracker(sources).extend(None, filmed)
     motions = model.smooth_motions(0)
     assert motions is not None and found.shape == (FRAMES, MODES)
@@ -133,9 +131,7 @@ def test_losses_are_those_of_the_tracked_kernels(model: GausSim, sources: Source
     assert supervision.static(filmed, SCENE.means, 0).losses[-1] > 0
 
 
-def test_what_was_tracked_is_not_tracked_again(
-    sources: Sources, filmed: SequenceSample, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_tracked_is_not_tracked_again(sources, filmed, monkeypatch) -> None:
     first = TrackSupervision(sources, iterations=2)
     known = first.motion(filmed)
     resumed = TrackSupervision(sources, iterations=2)
@@ -146,9 +142,7 @@ def test_what_was_tracked_is_not_tracked_again(
     assert torch.equal(resumed.motion(shorter).positions, known.positions)
 
 
-def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
-    model: GausSim, sources: Sources, filmed: SequenceSample
-) -> None:
+def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(model, sources, filmed) -> None:
     module = GausSimModule(
         method=SharedSimulator(model, ModalInitialStates(model, [0]), [0]),
         renderer=CpuRenderer(),

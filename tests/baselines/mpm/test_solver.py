@@ -314,25 +314,6 @@ def rolled(solver, x, velocity, frames):
     return states
 
 
-def test_centre_falls_on_the_parabola():
-    x = lattice((0.4, 0.4, 0.6), (0.6, 0.6, 0.75), 1 / 32)
-    states = rolled(above_floor(x), x, [0.1, 0.0, 0.0], 10)
-    fallen = torch.stack([s.positions.mean(0) for s in states]) - x.mean(0)
-    t = 0.05 * torch.arange(11)
-    assert fallen[:, 0].tolist() == pytest.approx((0.1 * t).tolist(), abs=1e-4)
-    assert fallen[:, 2].tolist() == pytest.approx((-0.5 * GRAVITY * t**2).tolist(), rel=0.02, abs=5e-4)
-
-
-def test_block_bounces_off_the_floor_and_does_not_enter_it():
-    x = lattice((0.4, 0.4, 0.45), (0.6, 0.6, 0.6), 1 / 32)
-    states = rolled(above_floor(x), x, [0.0, 0.0, 0.0], 24)
-    height = torch.stack([s.positions[:, 2].mean() for s in states])
-    low = torch.stack([s.positions[:, 2].min() for s in states])
-    assert low.min() > FLOOR - 0.2 / 16
-    bottom = int(height.argmin())
-    assert 8 < bottom < 20 and height[bottom:].max() > height[bottom] + 0.02
-
-
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_sliding_block_is_slowed_by_friction_times_gravity(friction):
     x = lattice((0.2, 0.4, FLOOR + 0.015), (0.4, 0.6, FLOOR + 0.14), 1 / 32)
