@@ -105,6 +105,7 @@ def played(_played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> SimpleN
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: "browser" not in item.path.name)  # the longest first, or one process waits for another
     if torch.cuda.is_available():
         return
     for item in items:

@@ -98,9 +98,8 @@ def test_commands_and_options_of_the_pages_exist() -> None:
 
 
 def test_modules_and_functions_named_in_the_pages_exist() -> None:
-    named = {
-        name for page in PAGES for name in re.findall(r"(?:`|::: )(gausim(?:\.\w+)+)(?:\(|`|\n)", page.read_text())
-    }
+    pattern = r"(?:`|::: )(gausim(?:\.\w+)+)(?:\(|`|\n)"
+    named = {name for page in PAGES for name in re.findall(pattern, page.read_text())}
     assert len(named) > 5
     for name in named:
         assert pkgutil.resolve_name(name) is not None
@@ -144,9 +143,8 @@ def test_scripts_of_the_tables_name_commands_options_and_keys_that_exist(script:
         (tmp_path / name).chmod(0o755)
     calls = tmp_path / "calls"
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
-    subprocess.run(
-        ["bash", str(script)], check=True, cwd=tmp_path, env=os.environ | {"PATH": path, "CALLS": str(calls)}
-    )
+    environment = os.environ | {"PATH": path, "CALLS": str(calls)}
+    subprocess.run(["bash", str(script)], check=True, cwd=tmp_path, env=environment)
     lines = [line.rstrip("\0").split("\0") for line in calls.read_text().splitlines()]
     assert lines
     for name, *words in lines:
@@ -182,10 +180,8 @@ def test_command_blocks_of_readme_tutorials_and_how_tos_run(tmp_path: Path, monk
     from gausim.cli.main import main
 
     monkeypatch.chdir(tmp_path)
-    tiny = (
-        "--quick --objects pudding_soft --sequences 2 --frames 20 --kernels 80 --resolution 32 --workers 1 --out data"
-    )
-    assert synthesize(tiny.split()) == 0
+    tiny = "--quick --objects pudding_soft --sequences 2 --frames 20 --kernels 80 --resolution 32 --workers 1"
+    assert synthesize([*tiny.split(), "--out", "data"]) == 0
     done = 0
     for page in RUNNABLE:
         text = (ROOT / page).read_text().replace("\\\n", " ")

@@ -6,6 +6,7 @@ import importlib
 import io
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -76,19 +77,21 @@ def test_pages(page: Path) -> None:
     assert len(text.split()) <= LONGEST_PAGE or page.parent.name in ("reference", "results") or page.stem == "results"
 
 
-def _help() -> Iterator[tuple[str, str]]:
-    yield "gausim", usage()
+@cache
+def _help() -> dict[str, str]:
+    texts = {"gausim": usage()}
     mains = [(f"gausim {name}", command_of(name)) for name in COMMANDS]
     mains += [(f"gausim prepare {name}", importlib.import_module(f"data_prep.{name}").main) for name in STAGES]
     for name, main in mains:
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
             main(["--help"])
-        yield name, said.getvalue()
+        texts[name] = said.getvalue()
+    return texts
 
 
 def test_help_texts() -> None:
-    texts = dict(_help())
+    texts = _help()
     assert len(texts) > 20 and all(len(text) > 100 for text in texts.values())
     assert not {name: found for name, text in texts.items() if (found := faults(text))}
 
@@ -128,7 +131,7 @@ def test_options_begin_with_a_verb() -> None:
     """No option of the commands begins as a description does: with a preposition, an article or a plural noun."""
     described = r"(?:of|a|an|the|its|with|for|behind|instead|also|number|default|folder|frames|fraction|size)\b"
     wrong = {}
-    for name, text in _help():
+    for name, text in _help().items():
         options = text.partition("options:")[2]
         found = re.findall(rf"(?m)^  (--[\w-]+(?: \S+)*?)(?:  +|\n {{8,}}){described}", options)
         if found:

@@ -28,12 +28,7 @@ def test_recovers_an_exact_linear_oscillation(n_modes: int):
         assert torch.allclose(predicted, truth, atol=1e-8)
 
 
-def test_short_sequences_are_refused():
-    with pytest.raises(DataError, match="at least 3 seen frames"):
-        fit_linear_ar([torch.zeros(2, 4, 3)], 2)
-
-
-def test_four_frames_remember_what_two_do_not_show():
+def test_four_frames_remember_what_two_do_not_and_few_are_refused() -> None:
     """Points that show only the sum of two oscillations: not AR(2), but exactly AR(4)."""
     sequences = []
     for seed in range(4):
@@ -50,6 +45,8 @@ def test_four_frames_remember_what_two_do_not_show():
     for truth in sequences:
         assert torch.allclose(four.rollout(truth[:4], 39), truth, atol=1e-6)
         assert not torch.allclose(two.rollout(truth[:2], 39), truth, atol=0.05)
+    with pytest.raises(DataError, match="at least 3 seen frames"):
+        fit_linear_ar([torch.zeros(2, 4, 3)], 2)
 
 
 def test_the_ridge_is_chosen_where_noise_needs_one():

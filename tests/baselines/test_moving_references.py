@@ -81,15 +81,12 @@ def beam(turn: float = 0.0) -> tuple[GaussianScene, HandPath]:
     return body, HandPath.of(torch.stack(frames), hand[hand >= 0])
 
 
-def test_held_kernels_follow_their_hand_and_all_follow_both_alike() -> None:
+def test_kernels_follow_hands_as_a_beam_bends() -> None:
     body, hands = beam()
     followed = hands_motion(body, hands, fps=FPS, steps=1)
     torch.testing.assert_close(followed.positions[0], body.means)
     torch.testing.assert_close(followed.positions[1], body.means + torch.tensor([0.0, 0.1, 0.0]))
-
-
-def test_turned_ends_bend_a_beam_into_its_static_curve() -> None:
-    """Ends turned by theta and -theta: the middle of a beam rises by theta L / 4, everywhere by theta x (1 - x)."""
+    # Ends turned by theta and -theta: the middle of a beam rises by theta L / 4, everywhere by theta x (1 - x).
     turn = 0.05
     body, hands = beam(turn)
     followed = hands_motion(body, hands, fps=FPS, steps=1)
@@ -101,9 +98,6 @@ def test_turned_ends_bend_a_beam_into_its_static_curve() -> None:
     pose = hands.pose(1)
     torch.testing.assert_close(followed.positions[1, held], pose.move(body.means[held], body.hand[held]))
     assert followed.rotations[1][free & (body.means[:, 0] == 0.5)].sub(torch.eye(3)).abs().max() < 1e-5
-
-
-def test_pins_that_no_hand_moves_hold_back() -> None:
     body, hands = beam()
     hand = torch.where(body.hand == 1, -1, body.hand)
     weights = hand_weights(replace(body, hand=hand))

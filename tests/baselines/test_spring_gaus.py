@@ -34,7 +34,7 @@ def net_and_state(seed: int = 0, *, count: int = 24, neighbours: int = 20) -> tu
     }
 
 
-def test_every_pair_is_one_spring_to_a_near_anchor() -> None:
+def test_pairs_are_springs_to_near_anchors_that_fade() -> None:
     net, s = net_and_state()
     pairs = set(zip(net.first.tolist(), net.second.tolist(), strict=True))
     assert len(pairs) == len(net.first) and bool((net.first < net.second).all())
@@ -43,9 +43,6 @@ def test_every_pair_is_one_spring_to_a_near_anchor() -> None:
     assert int(net.rank.max()) < net.reach == 20
     held = s["free"][:, 0] == 0
     assert not bool((held[net.first] & held[net.second]).any())
-
-
-def test_attenuation_spares_the_nearest_and_ends_at_the_farthest() -> None:
     net, _ = net_and_state(count=60, neighbours=40)
     fade = net.attenuation(torch.tensor(0.0))
     assert bool((fade[net.rank < 16] == 1).all())

@@ -14,21 +14,15 @@ def stage(iterations: int = 10, **options: object) -> Stage:
     return Stage(iterations, {"a": 0.1}, MixedLoss(l1=1.0), **options)  # type: ignore[arg-type]
 
 
-def test_epochs_walk_through_the_stages() -> None:
+def test_epochs_walk_through_stages_with_their_windows_and_rates() -> None:
     plan = FitPlan({"first": stage(10), "left": None, "second": stage(20)}, round=5)
     assert plan.shows == 5 and plan.epochs == 6
     places = [(name, done) for name, _, done in (plan.place(e) for e in (0, 1, 1.5, 2, 5, 6, 7))]
     assert places == [("first", 0), ("first", 5), ("first", 7.5), ("second", 0), ("second", 15),
                       ("second", 20), ("second", 20)]  # fmt: skip
     assert FitPlan({"short": stage(3), "long": stage(7)}, round=5).shows == 3
-
-
-def test_the_window_grows_from_the_first_to_the_last_epoch_of_a_stage() -> None:
     plan = FitPlan({"few": stage(5, frames=[2, 2]), "more": stage(20, frames=[4, 0])}, round=5)
     assert [plan.steps(float(epoch), 10) for epoch in range(5)] == [2, 4, 6, 8, 10]
-
-
-def test_rates_follow_their_groups_schedule() -> None:
     schedules = {"default": HalvingSchedule(100, 100), "b": ExponentialSchedule(0.01)}
     made = Stage(300, {"a": 1e-3, "b": 1e-2}, MixedLoss(l1=1.0), schedules=schedules)
     assert [made.rate("a", i) for i in (0, 99, 100, 250)] == [1e-3, 1e-3, 5e-4, 2.5e-4]

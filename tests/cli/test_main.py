@@ -90,12 +90,10 @@ def test_errors_of_files_and_values_are_one_line(command, capsys, error: Excepti
 @pytest.mark.parametrize("encoding", ["latin-1", "ascii", "cp437"])
 def test_text_that_the_terminal_lacks_is_escaped(encoding: str) -> None:
     code = "import sys; sys.modules['gausim.cli.report'] = m = type(sys)('x'); "
-    code += (
-        "m.main = lambda argv: print('a \\u2026 b \\u2013') or 0; from gausim.cli.main import main; main(['report'])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=True
-    )
+    code += "m.main = lambda argv: print('a \\u2026 b \\u2013') or 0; "
+    code += "from gausim.cli.main import main; main(['report'])"
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
     assert done.stdout.strip() == b"a \\u2026 b \\u2013"
 
 

@@ -6,12 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import toy_object
-from helpers.simulators import LEVELS
 from msgspec.structs import replace
 
-from gausim.cli import simulate, train
-from gausim.compose.build import load_run
+from gausim.cli import simulate
 from gausim.compose.live import ENERGY_ROOM, open_interaction
 from gausim.core import DataError
 from gausim.interaction import session as do
@@ -97,13 +94,6 @@ def test_parts_and_directions(played) -> None:
     assert impulse == Impulse(Whole(), (1.0, 2.0, -3.0), 0.1)
 
 
-TINY = (
-    LEVELS, "model.simulator.template.modes=8", "model.simulator.network.hidden=8", "plan.t_max=3",
-    "plan.repeats=1", "plan.batch_size=2", "plan.epochs=4", "trainer.accelerator=cpu", "trainer.progress=false",
-    "trainer.threads=1", "render=cpu", "trainer.panel_epochs=0", "logger=none", "name=toy",
-)  # fmt: skip
-
-
 def random_event(r: random.Random, live: Interaction) -> Event:
     scene = live.scene
     kernel = r.choice((scene.simulated & ~scene.pinned).nonzero()[:, 0].tolist())
@@ -122,12 +112,8 @@ def random_event(r: random.Random, live: Interaction) -> Event:
 
 
 @pytest.mark.slow
-def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    root = toy_object.write_toy_object(tmp_path / "data" / "toy").root
-    assert train.main([f"data.root={root}", *TINY]) == 0
-    run = load_run("outputs/toy/seed_0")
-    live = open_interaction(run, keep=None)
+def test_a_thousand_steps_of_random_forces(played) -> None:
+    live = open_interaction(played, keep=None)
     scene, r = live.scene, random.Random(0)
     held = scene.pinned | ~scene.simulated
     rest = covariance_from_scales(scene.log_scales.double(), scene.quats.double())
@@ -146,7 +132,7 @@ def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.M
     moved = (recorded.positions - scene.means).norm(dim=-1).amax(1) / scene.diagonal
     assert 0.02 < float(moved.max()) < 2
     start = replace(session, steps=100, entries=tuple(e for e in session.entries if e.at < 100))
-    again = replay(open_interaction(load_run("outputs/toy/seed_0")), start)
+    again = replay(open_interaction(played), start)
     assert torch.equal(again.positions, recorded.positions[:101])
     assert torch.equal(again.deformation_gradients, recorded.deformation_gradients[:101])
     ceiling = live._dynamics.energy_ceiling

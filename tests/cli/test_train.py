@@ -83,12 +83,6 @@ def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> N
     assert command.main([*again, "overwrite=true"]) == 0
 
 
-def test_a_changed_config_is_refused_by_the_name_of_its_keys(again: list[str]) -> None:
-    (RUN / "FINISHED").unlink()
-    with pytest.raises(RunError, match=r"changed: loss\.image\.balance, loss\.static_weight\."):
-        command.main([*again, "loss.static_weight=2", "loss.image.balance=0.7"])
-
-
 def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str], capsys) -> None:
     with pytest.raises(ConfigError, match="modle"):
         command.main([*arguments, "modle=gausim"])

@@ -177,9 +177,7 @@ class Capture:
         views = Cameras(narrow.viewmats, wide, 64, 64, narrow.names)
         self.toy = toy_object.ToyObject(folder, toy_object.toy_scene(), frames=12, cameras=views)
         self.folder = folder
-        self.motion = {
-            name: toy_object.rgba(self.toy.scene, self.toy.truth(name), views) for name in self.toy.amplitudes
-        }
+        self.motion = {n: toy_object.rgba(self.toy.scene, self.toy.truth(n), views) for n in self.toy.amplitudes}
         self._write_photos()
 
     def _before_green(self, rgba: torch.Tensor) -> np.ndarray:

@@ -116,9 +116,8 @@ def three_cameras(rate: Fraction, late: float = 7.3) -> dict[str, Camera]:
     """The second camera begins ``late`` frames after the first, the third three frames before the first."""
     frame, count = 1 / float(rate), int(1.6 * rate)
     audio = ("aac", "pcm_s16le", "aac")
-    return {
-        f"cam_{i}": Camera(0.2 + start * frame, rate, count, audio[i], seed=i) for i, start in enumerate((0, late, -3))
-    }
+    starts = enumerate((0, late, -3))
+    return {f"cam_{i}": Camera(0.2 + start * frame, rate, count, audio[i], seed=i) for i, start in starts}
 
 
 @pytest.fixture(scope="module", params=[Fraction(50), NTSC], ids=["50", "29.97"])
@@ -314,9 +313,8 @@ def test_jitter_is_no_other_rate_and_slow_motion_is(tmp_path: Path) -> None:
         Camera(0.0, Fraction(30), 30, audio=None).write(tmp_path / "in" / f"{name}.mp4", stamps=stamps, ticks=100)
         assert not probe(tmp_path / "in" / f"{name}.mp4").variable
     found = ingested(tmp_path / "in", tmp_path / "out", sync="offsets", offsets={"b": "0"})
-    assert found["fps"] == pytest.approx(30, rel=2e-3) and all(
-        c["residual_frames"]["largest"] < 0.4 for c in found["cameras"].values()
-    )
+    assert found["fps"] == pytest.approx(30, rel=2e-3)
+    assert all(c["residual_frames"]["largest"] < 0.4 for c in found["cameras"].values())
     slow = [*range(0, 40, 4), *range(40, 60), *range(60, 100, 4)]
     Camera(0.0, Fraction(120), len(slow), audio=None).write(tmp_path / "slow.mp4", stamps=slow)
     with pytest.raises(DataError, match=r"slow\.mp4: its rate varies.*ingest"):

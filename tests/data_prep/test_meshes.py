@@ -27,9 +27,8 @@ def ply(
 ) -> Path:
     header = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {count or len(CORNERS)}\n"
     header += "property float x\nproperty float y\nproperty double z\nproperty uchar red\n"
-    header += (
-        f"element face {len(faces)}\nproperty uchar quality\nproperty list uchar {kind} vertex_indices\nend_header\n"
-    )
+    header += f"element face {len(faces)}\nproperty uchar quality\nproperty list uchar {kind} vertex_indices\n"
+    header += "end_header\n"
     if encoding == "ascii":
         lines = [f"{x} {y} {z} 255" for x, y, z in CORNERS]
         lines += [f"7 {len(face)} " + " ".join(map(str, face)) for face in faces]

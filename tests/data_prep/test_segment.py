@@ -179,6 +179,5 @@ def test_clips_are_found_in_natural_order(tmp_path: Path) -> None:
     clips = find_clips(tmp_path)
     assert [(c.name, c.moving) for c in clips] == [("b", False), ("sequences/seq_000/cam_0", True)]
     assert [p.name for p in clips[0].paths] == ["9.png", "10.png"]
-    assert (
-        all(c.moving for c in find_clips(tmp_path, kind="film")) and not find_clips(tmp_path, kind="stills")[1].moving
-    )
+    films, stills = (find_clips(tmp_path, kind=kind) for kind in ("film", "stills"))
+    assert all(c.moving for c in films) and not stills[1].moving

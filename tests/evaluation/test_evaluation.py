@@ -4,7 +4,7 @@ import torch
 from helpers import toy_object
 
 from gausim.baselines.references import static_motion
-from gausim.core import DataError, RunError, Trajectory
+from gausim.core import RunError, Trajectory
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import evaluate_object, results_of, write_evaluation
 from gausim.render.reference import ReferenceRenderer
@@ -108,18 +108,6 @@ def test_files_follow_the_schema(evaluated, tmp_path):
             assert np.array_equal(loaded.values[row][metric], values, equal_nan=True)
     table = (tmp_path / "evaluation" / "table.md").read_text()
     assert "### seen 0..7, training views" in table and f"| {FLOOR} |" in table
-
-
-def test_part_of_the_sequences_and_views(toy):
-    methods = {"oracle": lambda record: toy.truth(record.name)}
-    data = ObjectData(toy.root)
-    curves = evaluate_object(data, toy.scene, methods, ReferenceRenderer(), sequences=["seq_001"], views=["cam_2"])
-    assert curves.values["oracle"]["l2"].shape == (1, 20, 1)
-    table = results_of([curves], {}).table
-    assert {entry.views for entry in table if entry.split == "seen"} == {"heldout", "points"}
-    assert FLOOR not in {entry.row for entry in table}
-    with pytest.raises(DataError, match="seq_9"):
-        evaluate_object(data, toy.scene, methods, ReferenceRenderer(), sequences=["seq_9"])
 
 
 def test_unusable_predictions_are_named(toy):

@@ -50,9 +50,8 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
 
 
 def test_the_film_is_truth_prediction_and_error_in_the_view_held_out(toy, tmp_path):
-    curves = evaluate_object(
-        ObjectData(toy.root), toy.scene, {"oracle": Oracle(toy)}, ReferenceRenderer(), films=tmp_path
-    )
+    data, methods = ObjectData(toy.root), {"oracle": Oracle(toy)}
+    curves = evaluate_object(data, toy.scene, methods, ReferenceRenderer(), films=tmp_path)
     assert curves.info.film.startswith("seq_000 in cam_2 (held out).")
     frames = list(read_video(tmp_path / "film_toy.mp4"))
     assert len(frames) == 10 and frames[0].shape == (24 + 480 + 24 + 8, 3 * 480, 3)

@@ -31,9 +31,8 @@ class _RefuseOperations(TorchDispatchMode):
         assert name not in ASKING_ATEN, f"{func} waits for the device"
         result = func(*args, **(kwargs or {}))
         for value in tree_leaves((args, kwargs, result)):
-            assert not isinstance(value, Tensor) or value.device.type == "meta" or value.dim() == 0, (
-                f"{func}: on the CPU"
-            )
+            known = not isinstance(value, Tensor) or value.device.type == "meta" or value.dim() == 0
+            assert known, f"{func}: on the CPU"
         return result
 
 

@@ -107,9 +107,8 @@ def write_phystwin(root: Path) -> Sample:
         for f in range(FRAMES):
             image = sample.image(f, v)
             save(root / "color" / str(v) / f"{f}.png", before(image, 70))
-            save(
-                root / "mask" / str(v) / number[v] / f"{f}.png", np.where(image[..., 3] > 127, 255, 0).astype(np.uint8)
-            )
+            cut = np.where(image[..., 3] > 127, 255, 0).astype(np.uint8)
+            save(root / "mask" / str(v) / number[v] / f"{f}.png", cut)
             save(human / str(v) / "0" / f"{f}.png", hidden)
     dump(root / "metadata.json", {"intrinsics": [K.tolist()] * 3, "fps": 30, "WH": [SIZE, SIZE], "frame_num": FRAMES})
     dump(root / "split.json", {"frame_len": FRAMES, "train": [0, SEEN], "test": [SEEN, FRAMES]})

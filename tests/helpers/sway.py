@@ -104,9 +104,8 @@ def blobs(means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, view
     pixel = pixel[..., :2] / pixel[..., 2:].clamp_min(0.1)
     x, y = (torch.arange(n, device=means.device) + 0.5 for n in size)
     rows, columns = (torch.exp(-0.5 * (axis - pixel[..., i, None]) ** 2) for i, axis in ((1, y), (0, x)))
-    weight = (
-        opacities[:, None, :, None] * colors * (1 + 0.1 * covars.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, :, None]
-    )
+    size = 1 + 0.1 * covars.diagonal(dim1=-2, dim2=-1).sum(-1)
+    weight = opacities[:, None, :, None] * colors * size[:, None, :, None]
     rgb = torch.einsum("bvkh,bvkw,bvkc->bvhwc", rows, columns, weight).tanh()
     return Rendered(rgb, rgb.amax(-1))
 

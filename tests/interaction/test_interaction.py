@@ -255,9 +255,8 @@ class Broken:
         elif self._how == "far":
             positions[33, 1] += 20
         else:
-            deformation_gradients[self.unit_of_kernel[33]] *= torch.tensor(
-                [1.0, 1.0, 0.0 if self._how == "flat" else math.inf]
-            )
+            third = 0.0 if self._how == "flat" else math.inf
+            deformation_gradients[self.unit_of_kernel[33]] *= torch.tensor([1.0, 1.0, third])
         return replace(frame, positions=positions, deformation_gradients=deformation_gradients)
 
     def settle(self) -> None: ...
@@ -350,7 +349,6 @@ def test_a_hand_that_is_moved_leaves_the_others_to_the_recording() -> None:
     assert hands.pose(2) is path.pose(2)
     hands.move(Hand(to=(1.0, 0.0, 0.0), hand=1, frames=2), 2)
     torch.testing.assert_close(hands.places(1)[:, :3], torch.full((2, 3), 0.1).double(), atol=1e-6, rtol=0)
-    torch.testing.assert_close(
-        hands.places(4)[:, :3], torch.tensor([[0.4] * 3, [1.0, 0, 0]]).double(), atol=1e-6, rtol=0
-    )
+    expected = torch.tensor([[0.4] * 3, [1.0, 0, 0]]).double()
+    torch.testing.assert_close(hands.places(4)[:, :3], expected, atol=1e-6, rtol=0)
     assert hands.pose(4) is hands.pose(4)

@@ -82,19 +82,16 @@ def test_images_smaller_than_the_window_are_refused(double: bool) -> None:
         ImageLoss()(small, small)
 
 
-def test_static_loss_sums_squared_distances() -> None:
+def test_static_loss_and_the_objectives_windows_and_chances() -> None:
     rest = torch.zeros(4, 3)
     assert float(static_loss(rest + 2.0, rest, torch.full((len(rest), 1), 4.0))) == pytest.approx(3.0)
-
-
-def test_objective_windows_and_chances() -> None:
     assert Objective().static_chance(5) == pytest.approx(0.2)
     assert Objective(static_probability=0.5).static_chance(5) == 0.5
     assert Objective(static_weight=0.0).static_chance(1) == 0.0
     assert [Objective(backprop_steps=k).window(6) for k in (0, 1, 4, 9)] == [6, 1, 4, 6]
 
 
-def test_each_term_of_a_mixture_is_a_mean() -> None:
+def test_terms_of_a_mixture_are_means_with_the_gradients_of_their_sum() -> None:
     x, y = images(channels=4)
     color = (x - y)[..., :3]
     torch.testing.assert_close(MixedLoss(l1=2.0)(x[..., :3], y[..., :3]), 2 * color.abs().mean((1, 2, 3, 4)))
@@ -102,15 +99,6 @@ def test_each_term_of_a_mixture_is_a_mean() -> None:
     loss = MixedLoss(mse=3.0, alpha=5.0)
     assert loss.compares_alpha and not MixedLoss(mse=1.0).compares_alpha
     torch.testing.assert_close(loss(x, y), expected)
-
-
-def test_ssim_of_a_mixture_is_that_of_the_image_loss() -> None:
-    x, y = images()
-    other = ImageLoss(balance=0.0, window=5, pixels=1)  # (1 - SSIM) / 2, summed over channels
-    torch.testing.assert_close(MixedLoss(dssim=1.0, window=5)(x, y), 2 / 3 * other(x, y), rtol=1e-4, atol=1e-6)
-
-
-def test_gradients_of_a_mixture_are_those_of_the_sum() -> None:
     x, y = (v.double() for v in images(channels=4))
     loss = MixedLoss(l1=0.3, mse=0.2, dssim=0.5, alpha=0.7, window=5)
     values, gradient = loss.value_and_gradient(x, y)
@@ -119,3 +107,9 @@ def test_gradients_of_a_mixture_are_those_of_the_sum() -> None:
     torch.testing.assert_close(leaf.grad, gradient)
     step = 1e-6 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
     torch.testing.assert_close((loss(x + step, y) - values).sum(), (gradient * step).sum(), rtol=1e-3, atol=1e-10)
+
+
+def test_ssim_of_a_mixture_is_that_of_the_image_loss() -> None:
+    x, y = images()
+    other = ImageLoss(balance=0.0, window=5, pixels=1)  # (1 - SSIM) / 2, summed over channels
+    torch.testing.assert_close(MixedLoss(dssim=1.0, window=5)(x, y), 2 / 3 * other(x, y), rtol=1e-4, atol=1e-6)

@@ -65,12 +65,9 @@ def by_windows(image: np.ndarray, weights: dict[str, np.ndarray]) -> list[np.nda
 
 def independent(prediction: torch.Tensor, target: torch.Tensor, path: Path) -> float:
     weights = {name: tensor.double().numpy() for name, tensor in load_file(path).items()}
-    pairs = zip(
-        by_windows(prediction.double().numpy(), weights), by_windows(target.double().numpy(), weights), strict=True
-    )
-    return sum(
-        ((a - b) ** 2 * weights[f"lin{i}.weight"][:, None, None]).sum(0).mean() for i, (a, b) in enumerate(pairs)
-    )
+    features = (by_windows(x.double().numpy(), weights) for x in (prediction, target))
+    pairs = enumerate(zip(*features, strict=True))
+    return sum(((a - b) ** 2 * weights[f"lin{i}.weight"][:, None, None]).sum(0).mean() for i, (a, b) in pairs)
 
 
 @pytest.mark.parametrize("source", ["published", "random"])

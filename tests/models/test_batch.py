@@ -26,10 +26,8 @@ def test_union_of_scenes_and_sequences_equals_each_alone(options) -> None:
     model = make_model(scenes, **options)
     ids = (0, 1, 0)
     states = [make_state(scenes[s], seed=i) for i, s in enumerate(ids)]
-    forces = [
-        torch.randn(scenes[s].count, 3, generator=torch.Generator().manual_seed(i), dtype=torch.float64)
-        for i, s in enumerate(ids)
-    ]
+    draws = [torch.Generator().manual_seed(i) for i in range(3)]
+    forces = [torch.randn(scenes[s].count, 3, generator=g).double() for s, g in zip(ids, draws, strict=True)]
     batch = model.batch(ids)
     assert batch.scene_ids == ids and [m.scene_id for m in batch.members] == [0, 1, 0]
     joint = model.step(batch, join_states(states), torch.cat(forces))
@@ -57,9 +55,7 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(predicted, graph) 
     step = model.step(batch, make_state(scene))
     held = scene.pinned | ~scene.simulated
     last = member.units.stop - 1
-    assert torch.equal(step.deformation_gradients[last], torch.eye(3)) and torch.equal(
-        step.rotations[last], torch.eye(3)
-    )
+    assert all(torch.equal(x[last], torch.eye(3)) for x in (step.deformation_gradients, step.rotations))
     assert bool((member.unit_of_kernel[held] == last).all()) and not bool((member.unit_of_kernel[~held] == last).any())
     finest = hierarchy.ancestor(0, model.predicted_levels[-1])
     free = ~hierarchy.levels[0].pinned

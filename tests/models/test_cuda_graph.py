@@ -72,10 +72,8 @@ def test_step_asks_its_device_nothing(monkeypatch: pytest.MonkeyPatch, template:
 
 def test_rollouts_on_the_cpu_capture_nothing() -> None:
     scene = make_scene(50)
-    found = [
-        SceneDynamics(make_model(scene, cuda_graph=chosen)).rollout(make_state(scene), 3).positions
-        for chosen in (False, True)
-    ]
+    models = (make_model(scene, cuda_graph=chosen) for chosen in (False, True))
+    found = [SceneDynamics(model).rollout(make_state(scene), 3).positions for model in models]
     assert torch.equal(*found) and not torch.equal(found[0][0], found[0][3])
 
 

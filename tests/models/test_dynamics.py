@@ -64,10 +64,8 @@ def test_points_are_carried_by_the_unit_of_their_kernel() -> None:
             if free[k]:
                 members = unit == unit[k]
                 weight = mass[members, None] / mass[members].sum()
-                rest, now = (
-                    (weight * scene.means[members]).sum(0),
-                    (weight * trajectory.positions[frame][members]).sum(0),
-                )
+                both = scene.means, trajectory.positions[frame]
+                rest, now = ((weight * x[members]).sum(0) for x in both)
                 gradient = trajectory.deformation_gradients[frame, trajectory.unit_of_kernel[k]]
                 expected = now + gradient @ (points[p] - rest)
             assert torch.allclose(carried[frame, p], expected, atol=1e-12)

@@ -237,8 +237,7 @@ def test_a_load_acts_on_masses_and_stiffness_of_its_own(elastic: ElasticScene) -
     strained = torch.cat((0.0 * accelerations, torch.eye(3).double().flatten().expand(2, len(elastic.modes), 9)), -1)
     assert not PreparedElastic(elastic).force(strained).any()
     elastic.beyond[:, 1:] = 0.2
-    bulk = (
-        0.2 * (2 / 2.6 + 3 * 0.3 / (1.3 * 0.4)) * (2 * math.pi / 12.0) ** 2
-    )  # of Young's modulus 1, Poisson's ratio 0.3
+    # Of Young's modulus 1, Poisson's ratio 0.3.
+    bulk = 0.2 * (2 / 2.6 + 3 * 0.3 / (1.3 * 0.4)) * (2 * math.pi / 12.0) ** 2
     expected = -bulk * elastic.strains[:, ::4].sum((0, 1))
     torch.testing.assert_close(PreparedElastic(elastic).force(strained)[0], expected, atol=1e-6, rtol=1e-4)

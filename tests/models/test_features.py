@@ -5,9 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from helpers.bodies import make_model, make_scene, make_state
 
-from gausim.core import SimState
 from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, edge_features, network_inputs
 from gausim.models.step.recursion import Solved, Units
 
@@ -48,17 +46,13 @@ def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
     density, attributes = torch.linspace(-1, 1, 4).double(), torch.rand(4, 2).double()
     floor = torch.rand(4, FLOOR_FEATURES).double()
     units = Units(unit.rest, unit.now, unit.before, density.exp(), density, attributes, floor)
-    above = Solved(
-        parent.rest, parent.now, parent.before, parent.after, template.rest[:2], gradient, gradient, index
-    )  # fmt: skip
+    above = Solved(*parent, template.rest[:2], gradient, gradient, index)
     constants = torch.full((4, 1), size).double(), torch.full((4, 1), DT).double()
     edges = torch.zeros(2, 0, dtype=torch.int64)
     out, _ = network_inputs(units, template.now, above, edges, *constants, options, coarse=coarse)
     for i, p in enumerate(index.tolist()):
         target, rest, now, before = (x[i].numpy() for x in (template.now, unit.rest, unit.now, unit.before))
-        p_rest, p_now, p_before, p_after = (
-            x[p].numpy() for x in (parent.rest, parent.now, parent.before, parent.after)
-        )  # fmt: skip
+        p_rest, p_now, p_before, p_after = (x[p].numpy() for x in parent)
         after = p_after + gradient[p].numpy() @ (target - template.rest[p].numpy())
         inertial = -(p_after - 2 * p_now + p_before) / DT**2
         local = after - p_after if coarse else now - p_now
@@ -113,16 +107,3 @@ def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(dtype: 
     for column in range(out.shape[1]):
         for gradient in torch.autograd.grad(out[:, column].sum(), (unit, about), retain_graph=True):
             assert bool(torch.isfinite(gradient).all())
-
-
-def test_parent_with_one_child_gives_a_finite_step_and_gradient() -> None:
-    scene = make_scene(60)
-    model = make_model(scene, radii=(0.3, 0.35))
-    batch = model.batch((0,))
-    assert 1 in torch.bincount(batch.levels[1].parent).tolist()
-    state = make_state(scene)
-    positions = state.positions.requires_grad_()
-    step = model.step(batch, SimState(positions, state.previous))
-    gradient = torch.autograd.grad(step.positions.square().sum(), positions)[0]
-    assert bool(torch.isfinite(step.positions).all()) and bool(torch.isfinite(gradient).all())
-    assert float(gradient.abs().max()) > 0

@@ -18,9 +18,8 @@ def test_every_unit_has_one_parent_of_its_own_kind_and_volumes_add_up() -> None:
         assert fine.parent.shape == (fine.count,)
         assert set(fine.parent.tolist()) == set(range(coarse.count))  # each has a parent, no parent is empty
         assert torch.equal(coarse.pinned[fine.parent], fine.pinned)  # a cluster never mixes pinned and free
-        assert torch.allclose(
-            coarse.volume, coarse.volume.new_zeros(coarse.count).index_add(0, fine.parent, fine.volume)
-        )
+        summed = coarse.volume.new_zeros(coarse.count).index_add(0, fine.parent, fine.volume)
+        assert torch.allclose(coarse.volume, summed)
         assert torch.allclose(coarse.volume.sum(), volume.sum(), rtol=1e-12)
     assert len(hierarchy.levels[-1].parent) == 0
     assert 0 < int(hierarchy.levels[-1].pinned.sum()) < hierarchy.levels[-1].count
@@ -50,7 +49,7 @@ def test_masses_add_up_level_by_level_with_random_densities(predicted) -> None:
                 assert torch.allclose(found[c], weighted)
 
 
-def test_centres_are_volume_weighted_and_ancestors_compose() -> None:
+def test_centres_are_volume_weighted_and_roots_the_nearest_pinned_kernel() -> None:
     scene = make_scene(90, dtype=torch.float64)
     hierarchy = build_hierarchy(scene, radii=RADII)
     base = hierarchy.levels[0]
@@ -64,12 +63,6 @@ def test_centres_are_volume_weighted_and_ancestors_compose() -> None:
     assert torch.equal(hierarchy.ancestor(1, 3)[hierarchy.ancestor(0, 1)], hierarchy.ancestor(0, 3))
     free = [int((~level.pinned).sum()) for level in hierarchy.levels]
     assert hierarchy.predictions([2, 1]) == free[2] + free[1]
-
-
-def test_root_is_the_nearest_pinned_kernel() -> None:
-    scene = make_scene(90, dtype=torch.float64)
-    hierarchy = build_hierarchy(scene, radii=RADII)
-    base = hierarchy.levels[0]
     for level in hierarchy.levels:
         for c in range(level.count):
             distance = (base.rest - level.rest[c]).norm(dim=-1).masked_fill(~base.pinned, float("inf"))

@@ -14,9 +14,8 @@ from gausim.models.rollout.dynamics import SceneDynamics
 def test_frames_that_are_not_known_continue_the_motion_backwards() -> None:
     x = torch.arange(12.0).view(4, 3)
     step = torch.ones(4, 3)
-    assert all(
-        torch.equal(a, b) for a, b in zip(SimState(x, x - step).remembering(2).older, (x - 2, x - 3), strict=True)
-    )
+    older = SimState(x, x - step).remembering(2).older
+    assert all(torch.equal(a, b) for a, b in zip(older, (x - 2, x - 3), strict=True))
     known = SimState(x, x - step, (x - 5 * step,)).remembering(3).older
     assert all(torch.equal(a, b) for a, b in zip(known, (x - 5, x - 9, x - 13), strict=True))
     assert SimState(x, x, (x, x)).remembering(1).older[0] is x and SimState(x, x).remembering(0).older == ()

@@ -102,9 +102,8 @@ def test_a_ceiling_bounds_what_forces_do() -> None:
     ceiling = max(_energies(model, small.positions))
 
     def pushed(energy_ceiling: float | None) -> torch.Tensor:
-        return (
-            SceneDynamics(model, 0, energy_ceiling=energy_ceiling).rollout(still, 80, forces=lambda _: push).positions
-        )
+        dynamics = SceneDynamics(model, 0, energy_ceiling=energy_ceiling)
+        return dynamics.rollout(still, 80, forces=lambda _: push).positions
 
     free, bound = pushed(None), pushed(ceiling)
     assert max(_energies(model, free)) > 20 * ceiling
@@ -115,9 +114,8 @@ def test_a_ceiling_bounds_what_forces_do() -> None:
     pinned = scene.pinned | ~scene.simulated
     assert torch.equal(bound[:, pinned], scene.means[pinned].expand(81, -1, -1))
     assert torch.equal(pushed(1e9), free)
-    gentle = SceneDynamics(model, 0, energy_ceiling=2 * ceiling).rollout(
-        still, 6, forces=lambda n: 0.2 * push if n < 2 else None
-    )
+    dynamics = SceneDynamics(model, 0, energy_ceiling=2 * ceiling)
+    gentle = dynamics.rollout(still, 6, forces=lambda n: 0.2 * push if n < 2 else None)
     assert torch.equal(gentle.positions, small.positions)
     limited = []
     for share in (0.01, 1.0):

@@ -82,7 +82,7 @@ def _random_feed(model, *, top: float, below: float) -> None:
 
 
 @torch.no_grad()
-def test_zero_where_children_have_no_gradients_of_their_own() -> None:
+def test_momentum_equals_the_double_sum_and_is_zero_without_own_gradients() -> None:
     scene = make_scene(90, dtype=torch.float64)
     model = make_model(scene)
     batch, state = model.batch((0,)), make_state(scene)
@@ -92,11 +92,6 @@ def test_zero_where_children_have_no_gradients_of_their_own() -> None:
         values.append(float(model.step(batch, state).momentum))
     assert max(values[:2]) < 1e-20
     assert min(values[2:]) > 1e-6
-
-
-@torch.no_grad()
-def test_equals_the_double_sum_over_parents_and_children() -> None:
-    scene = make_scene(90, dtype=torch.float64)
     model = make_model(scene, output_scale=5.0)
     step = model.step(model.batch((0,)), make_state(scene))
     hierarchy = model.hierarchies[0]
@@ -134,7 +129,7 @@ def test_off_switch_and_single_level_give_exactly_zero_and_the_same_motion() -> 
     assert float(flat.step(flat.batch((0,)), state).momentum) == 0
 
 
-def test_the_lever_moves_by_the_shift_and_the_volume_is_kept() -> None:
+def test_levers_move_by_the_shift_and_keep_volume() -> None:
     generator = torch.Generator().manual_seed(0)
     lever = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     shift = 0.1 * torch.randn(20, 3, generator=generator, dtype=torch.float64)
@@ -146,9 +141,6 @@ def test_the_lever_moves_by_the_shift_and_the_volume_is_kept() -> None:
     free = lever_deformation(shift, lever, length, conserve_mass=False)
     torch.testing.assert_close((free @ lever[..., None])[..., 0], moved, atol=1e-6, rtol=0)
     assert float((torch.linalg.det(free) - 1).abs().max()) > 1e-2
-
-
-def test_no_shift_is_the_identity_and_short_levers_hardly_move() -> None:
     lever = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [SHORT, 0.0, 0.0]], dtype=torch.float64)
     length = torch.ones(3, 1, dtype=torch.float64)
     still = lever_deformation(torch.zeros_like(lever), lever, length, conserve_mass=True)

@@ -94,9 +94,8 @@ def test_a_turned_and_moved_scene_gives_turned_and_moved_motion(sees_floor: bool
     normal, point = (turn @ torch.tensor(x).double() for x in (FLOOR.normal, FLOOR.point))
     floor = replace(FLOOR, normal=tuple(normal.tolist()), point=tuple((point + shift).tolist()))
     gravity = tuple((turn @ torch.tensor([0.0, 0.0, FALL]).double()).tolist())
-    other = replace(
-        scene, means=scene.means @ turn.mT + shift, surroundings=Surroundings(free=True, gravity=gravity, floor=floor)
-    )
+    around = Surroundings(free=True, gravity=gravity, floor=floor)
+    other = replace(scene, means=scene.means @ turn.mT + shift, surroundings=around)
     model, moved = _frozen(scene, floor=sees_floor), _frozen(other, floor=sees_floor)
     moved.load_state_dict(model.state_dict())
     state = _thrown(scene)
@@ -150,9 +149,8 @@ def test_units_see_how_near_the_floor_is_and_where(monkeypatch: pytest.MonkeyPat
 def test_models_of_scenes_without_a_floor_are_as_before_and_networks_fit_both_ways() -> None:
     bare, floored = _block(free=True), _block(free=True, floor=FLOOR)
     before, model = _frozen(bare), _frozen(bare, floor=True)
-    assert all(
-        torch.equal(x, y) for x, y in zip(before.state_dict().values(), model.state_dict().values(), strict=True)
-    )
+    states = (m.state_dict().values() for m in (before, model))
+    assert all(torch.equal(x, y) for x, y in zip(*states, strict=True))
     both = make_model([bare, floored], **NEURAL, floor=True).double()
     wide, narrow = ({n: x for n, x in m.state_dict().items() if n.startswith("predictor")} for m in (both, model))
     model.load_state_dict(with_floor_columns(wide, narrow), strict=False)
@@ -160,9 +158,7 @@ def test_models_of_scenes_without_a_floor_are_as_before_and_networks_fit_both_wa
     model.load_state_dict({n: x for n, x in both.state_dict().items() if n in model.state_dict()
                            and not n.startswith("predictor")}, strict=False)  # fmt: skip
     # Without a floor the columns of the floor read zeros.
-    torch.testing.assert_close(
-        model.step(model.batch((0,)), state).positions, both.step(both.batch((0,)), state).positions
-    )
+    torch.testing.assert_close(*(m.step(m.batch((0,)), state).positions for m in (model, both)))
     again = with_floor_columns(narrow, wide)
     name = next(n for n in wide if n.endswith("node_encoder.0.weight"))
     assert again[name].shape == wide[name].shape and bool((again[name][:, -4:] == 0).all())
@@ -213,9 +209,8 @@ def test_loss_gradients_of_many_near_contacts_tell_of_their_sum_only() -> None:
     for _ in range(20):
         guess = contact._impulses(spread, wanted, guess)[1]
     found = torch.autograd.functional.jacobian(lambda b: contact._impulses(spread, b, guess)[0], wanted)
-    exact = torch.autograd.functional.jacobian(
-        lambda b: _solved(spread, b, pressing, ~pressing, torch.zeros(10, 2).double()), wanted
-    )
+    still = torch.zeros(10, 2).double()
+    exact = torch.autograd.functional.jacobian(lambda b: _solved(spread, b, pressing, ~pressing, still), wanted)
     assert found.abs().max() < 0.03 * exact.abs().max()  # how the points share an impulse
     whole, right = body.mT @ found @ body, body.mT @ exact @ body  # what becomes of the plate
     assert (whole - right).norm() < 0.1 * right.norm()

@@ -37,17 +37,14 @@ def test_splines_reproduce_linear_fields_and_their_gradients(grid: grids.Grid) -
     np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), atol=1e-11)
 
 
-def test_the_inside_of_a_closed_shell_is_body_and_a_sheet_stays_a_sheet() -> None:
+def test_cells_are_closed_without_holes_and_do_not_depend_on_rounding() -> None:
     shell = np.ones((9, 9, 9), dtype=bool)
     shell[1:-1, 1:-1, 1:-1] = False
     assert grids.inside(shell).all()
     sheet = np.zeros((9, 9, 9), dtype=bool)
     sheet[:, :, 4] = True
     np.testing.assert_array_equal(grids.inside(sheet), sheet)
-
-
-def test_a_grid_is_not_so_fine_that_sparse_kernels_leave_holes() -> None:
-    """The volume of a cube is that of its solid cells; fine ones between its kernels are empty."""
+    # The volume of a cube is that of its solid cells; fine ones between its kernels are empty.
     rng = np.random.default_rng(0)
     points, face = rng.uniform(size=(300, 3)), rng.integers(0, 6, 300)
     points[np.arange(300), face // 2] = face % 2
@@ -57,6 +54,12 @@ def test_a_grid_is_not_so_fine_that_sparse_kernels_leave_holes() -> None:
         volumes[least] = weights[weights == weights.max()].sum()
     assert volumes[0.0] < 0.5 and volumes[1.7] == pytest.approx(1.0, abs=0.2)
     assert solid.SolidSettings(0.2, 1.7).size(points, diagonal) == pytest.approx(0.2 * diagonal)
+    points = np.random.default_rng(0).random((60, 3))
+    _, centres, weights = grids.cells(points, 0.3)
+    for shift in np.linspace(0.1, 7.7, 20):  # the outermost points lie on borders of cells
+        _, moved, same = grids.cells(points + shift, 0.3)
+        assert np.array_equal(weights, same)
+        np.testing.assert_allclose(moved - shift, centres, atol=1e-12)
 
 
 def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
@@ -80,17 +83,16 @@ def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
 def _bar(spacing: float = 0.25, modes: int = 40):
     """A bar of 4 x 1 x 1 held at one end, known by its faces only; its units are points on its axis and around it."""
     kernels = _shell((3.875, 0.875, 0.875), 0.125)  # each stands for the cell of 0.125 that begins there
-    x, y, z = np.meshgrid(
-        np.concatenate(([0], np.arange(16) / 4 + 0.125)), [0.1, 0.5, 0.9], [0.1, 0.5, 0.9], indexing="ij"
-    )
+    axes = np.concatenate(([0], np.arange(16) / 4 + 0.125)), [0.1, 0.5, 0.9], [0.1, 0.5, 0.9]
+    x, y, z = np.meshgrid(*axes, indexing="ij")
     rest = np.stack((x, y, z), -1).reshape(-1, 3)
     pinned, mass = rest[:, 0] == 0, np.full(len(rest), 2.0)
     found = solid.solid_body(kernels, kernels[:, 0] == 0, rest, mass, pinned, modes=modes, spacing=spacing)
     return (*found.of_units(rest, pinned)[:3], rest, mass, pinned)
 
 
-def test_a_held_bar_vibrates_as_theory_says() -> None:
-    values, phi, _, rest, mass, _ = _bar()
+def test_modes_of_a_held_bar() -> None:
+    values, phi, slopes, rest, mass, pinned = _bar()
     ratio = np.sqrt(values)
     along = np.einsum("nm,n->m", phi[:, 0], mass) ** 2
     first = int(along.argmax())  # stretches without turning: cos-like, the lowest axial mode
@@ -101,6 +103,13 @@ def test_a_held_bar_vibrates_as_theory_says() -> None:
     shape = np.sin(np.pi * rest[:, 0] / 8)
     cosine = phi[:, 0, first] @ shape / np.linalg.norm(phi[:, 0, first]) / np.linalg.norm(shape)
     assert abs(cosine) > 0.99
+    lowest = phi[..., :24]
+    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", lowest, mass, lowest), np.eye(24), atol=2e-2)
+    assert not phi[pinned].any() and not slopes[pinned].any()
+    assert (np.diff(values) > -1e-9).all() and values[0] == 1
+    few = _bar(spacing=0.6, modes=6)
+    many = _bar(spacing=0.6, modes=110)  # more than a third of the unknowns: dense
+    np.testing.assert_allclose(few[0], many[0][:6] * 1.0, rtol=1e-6)
 
 
 def test_a_body_is_held_inside_of_its_pinned_surface() -> None:
@@ -111,20 +120,6 @@ def test_a_body_is_held_inside_of_its_pinned_surface() -> None:
     body = solid.solid_body(kernels, kernels[:, 2] <= 0.5, rest, np.ones(len(rest)), free, modes=4, spacing=0.25)
     core = np.array([[1.0, 1.0, 0.125], [1.0, 1.0, 0.25]])  # no kernel within .5, pinned ones are the nearest
     assert np.abs(body.at(core)[0]).max() < 0.02 * np.abs(body.at(rest)[0]).max()
-
-
-def test_modes_are_orthonormal_under_the_units_mass_and_zero_where_pinned() -> None:
-    values, phi, slopes, _, mass, pinned = _bar()
-    lowest = phi[..., :24]
-    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", lowest, mass, lowest), np.eye(24), atol=2e-2)
-    assert not phi[pinned].any() and not slopes[pinned].any()
-    assert (np.diff(values) > -1e-9).all() and values[0] == 1
-
-
-def test_the_sparse_solver_agrees_with_the_dense_one() -> None:
-    few = _bar(spacing=0.6, modes=6)
-    many = _bar(spacing=0.6, modes=110)  # more than a third of the unknowns: dense
-    np.testing.assert_allclose(few[0], many[0][:6] * 1.0, rtol=1e-6)
 
 
 def test_gradients_of_modes_are_those_of_the_field() -> None:
@@ -151,15 +146,6 @@ def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:
     gram = np.einsum("nam,n,nak->mk", phi, mass, phi)
     np.testing.assert_allclose(gram, np.eye(len(values)), atol=1e-5)
     assert np.isfinite(slopes).all() and len(values) == 40 and not phi[held].any()
-
-
-def test_cells_do_not_depend_on_rounding() -> None:
-    points = np.random.default_rng(0).random((60, 3))
-    _, centres, weights = grids.cells(points, 0.3)
-    for shift in np.linspace(0.1, 7.7, 20):  # the outermost points lie on borders of cells
-        _, moved, same = grids.cells(points + shift, 0.3)
-        assert np.array_equal(weights, same)
-        np.testing.assert_allclose(moved - shift, centres, atol=1e-12)
 
 
 def _clamped(curved: int) -> tuple[solid.SolidBody, np.ndarray]:

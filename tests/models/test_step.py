@@ -22,9 +22,8 @@ def test_predicted_gradients_have_determinant_one_only_with_mass_on(predicted, g
     scene = make_scene(dtype=torch.float64)
     state = make_state(scene)
     for conserve in (True, False):
-        model = make_model(
-            scene, predicted_levels=predicted, graph_radii=graph, output_scale=30.0, conserve_mass=conserve
-        )
+        levels = {"predicted_levels": predicted, "graph_radii": graph}
+        model = make_model(scene, output_scale=30.0, conserve_mass=conserve, **levels)
         with torch.no_grad():
             step = model.step(model.batch((0,)), state)
         error = torch.cat([torch.linalg.det(f) - 1 for f in (*step.predicted, step.deformation_gradients)]).abs()
@@ -171,9 +170,8 @@ def _function(stepper: _Stepper, names: list[str], outputs: tuple[int, ...]):
 @pytest.mark.parametrize("coarse", [False, True])
 def test_gradcheck_of_the_whole_step(coarse) -> None:
     scene = make_scene(22, dtype=torch.float64, spare=2)
-    model = make_model(
-        scene, radii=(0.3, 0.6), edges="union", rest_inputs=coarse, coarse_inputs=coarse, attributes=2, output_scale=2.0
-    )
+    inputs = {"rest_inputs": coarse, "coarse_inputs": coarse, "attributes": 2}
+    model = make_model(scene, radii=(0.3, 0.6), edges="union", output_scale=2.0, **inputs)
     names = ["model.log_density.0", "model.attributes.0", "model.predictor.network.decoder.4.weight"]
     _gradcheck(model, scene, make_state(scene), names, outputs=(0, 1, 2, 3))
 

@@ -85,9 +85,16 @@ def test_layers_equal_the_same_by_hand_in_values_and_gradients(norm: str) -> Non
         assert torch.allclose(got, value, rtol=0, atol=1e-10 * max(1.0, float(value.abs().max())))
 
 
-def test_unknown_choices_are_refused() -> None:
+def test_names_of_weights_last_layer_and_unknown_choices() -> None:
     with pytest.raises(ConfigError, match=r"model\.simulator\.network\.norm is 'post'; expected one of pre, joint"):
         _network(norm="post")
+    keys = list(_network().state_dict())
+    assert keys == list(_network(precision="bf16", compile=True).state_dict())
+    assert "processor.0.from_nodes.weight" in keys and "processor.2.node.2.bias" in keys and "decoder.4.bias" in keys
+    network = mlp((4, 8, 3))
+    zero_output(network)
+    assert torch.equal(network(torch.randn(5, 4)), torch.zeros(5, 3))
+    assert float(network[0].weight.abs().max()) > 0
 
 
 def test_float32_equals_float64() -> None:
@@ -124,12 +131,6 @@ def test_permuting_nodes_and_edges_permutes_outputs() -> None:
     plain = network(nodes, edges, index)
     assert torch.allclose(permuted, plain[order], atol=1e-12)
     assert bool(((plain - plain[order]).abs() > 1e-3).any())
-
-
-def test_state_does_not_depend_on_how_it_is_computed() -> None:
-    keys = list(_network().state_dict())
-    assert keys == list(_network(precision="bf16", compile=True).state_dict())
-    assert "processor.0.from_nodes.weight" in keys and "processor.2.node.2.bias" in keys and "decoder.4.bias" in keys
 
 
 # Runs where nothing checks shapes and types: the compiler would trace the checks.
@@ -181,10 +182,3 @@ def test_compiled_equals_eager(how: dict[str, object]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
     assert int(done.stdout) > 0, "nothing was compiled"
-
-
-def test_zero_output_silences_only_the_last_layer() -> None:
-    network = mlp((4, 8, 3))
-    zero_output(network)
-    assert torch.equal(network(torch.randn(5, 4)), torch.zeros(5, 3))
-    assert float(network[0].weight.abs().max()) > 0

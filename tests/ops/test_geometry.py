@@ -24,14 +24,11 @@ def _product(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     return torch.cat((scalar, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + cross), -1)
 
 
-def test_turn_of_ninety_degrees_about_z_takes_x_to_y() -> None:
+def test_rotations_compose_as_quaternions_do_and_have_a_vector() -> None:
     half = math.pi / 4
     r = quaternion_to_matrix(torch.tensor([[math.cos(half), 0, 0, math.sin(half)], [1, 0, 0, 0]]))
     assert torch.allclose(r[0] @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6)
     assert torch.equal(r[1], torch.eye(3))
-
-
-def test_rotations_of_any_length_compose_as_quaternions_do() -> None:
     p, q = torch.randn(2, 40, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     a, b = quaternion_to_matrix(p), quaternion_to_matrix(q)
     eye = torch.eye(3, dtype=torch.float64).expand_as(a)
@@ -39,9 +36,6 @@ def test_rotations_of_any_length_compose_as_quaternions_do() -> None:
     assert torch.allclose(torch.linalg.det(a), torch.ones(40, dtype=torch.float64))
     assert torch.allclose(quaternion_to_matrix(_product(p, q)), a @ b, atol=1e-12)
     assert torch.allclose(quaternion_to_matrix(-7.5 * p), a, atol=1e-12)
-
-
-def test_the_vector_of_a_rotation() -> None:
     vector = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
     torch.testing.assert_close(rotation_vector(rotation_of(vector)), vector)
     torch.testing.assert_close(rotation_vector(torch.eye(3).double()), torch.zeros(3).double())
@@ -52,21 +46,15 @@ LOG_SCALES = torch.randn(12, 3, generator=G, dtype=torch.float64) * 0.5 - 2
 QUATS = torch.randn(12, 4, generator=G, dtype=torch.float64)
 
 
-def test_principal_axes_are_the_rotated_axes_with_squared_scales() -> None:
+def test_covariances_turn_deform_and_have_a_volume() -> None:
     covars, axes = covariance_from_scales(LOG_SCALES, QUATS), quaternion_to_matrix(QUATS)
     for i in range(3):
         axis = axes[:, :, i]
         assert torch.allclose((covars @ axis[..., None])[..., 0], axis * (2 * LOG_SCALES[:, i : i + 1]).exp())
-
-
-def test_transport_is_the_covariance_of_deformed_samples() -> None:
     gradient = torch.eye(3, dtype=torch.float64) + 0.4 * torch.randn(12, 3, 3, generator=G, dtype=torch.float64)
     root = torch.linalg.cholesky(covariance_from_scales(LOG_SCALES, QUATS))
     moved = gradient @ root
     assert torch.allclose(transport_covariance(root @ root.mT, gradient), moved @ moved.mT)
-
-
-def test_volume_is_proportional_to_the_root_of_det_two_pi_sigma() -> None:
     volume = kernel_volumes(LOG_SCALES, 300.0)
     root = torch.linalg.det(2 * math.pi * covariance_from_scales(LOG_SCALES, QUATS)).sqrt()
     assert torch.allclose(volume, root * (300.0**3 / (2 * math.pi) ** 1.5), rtol=1e-9)
@@ -97,13 +85,10 @@ def test_it_is_u_times_clamped_stretches_times_v_transposed(scale: float) -> Non
     assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
 
 
-def test_zero_output_is_the_identity() -> None:
+def test_the_head_is_the_identity_at_zero_and_differentiable() -> None:
     for conserve in (True, False):
         for value in deformation_gradient_from_output(torch.zeros(4, 11), conserve_mass=conserve):
             assert torch.equal(value, torch.eye(3).expand(4, 3, 3))
-
-
-def test_gradcheck_of_the_head() -> None:
     output = _outputs(0.7)[:4].requires_grad_()
     assert torch.autograd.gradcheck(lambda x: deformation_gradient_from_output(x, conserve_mass=True), output)
 
@@ -164,11 +149,7 @@ def test_deformed_covariances_and_untouched_kernels():
     rotations = torch.stack((torch.eye(3), quaternion_to_matrix(normal(1, 4, seed=5).float())[0]))
     unit = torch.tensor([0, 1, 1, 0, 1, 0])
     moved = deformed_scene(scene, scene.means + 1, deformation_gradients, rotations, unit)
-    expected = (
-        deformation_gradients[unit]
-        @ covariance_from_scales(scene.log_scales, scene.quats)
-        @ deformation_gradients[unit].mT
-    )
+    expected = transport_covariance(covariance_from_scales(scene.log_scales, scene.quats), deformation_gradients[unit])
     assert torch.allclose(covariance_from_scales(moved.log_scales, moved.quats), expected, rtol=1e-4, atol=1e-5)
     still = unit == 0
     for name in ("log_scales", "quats", "sh"):
@@ -177,7 +158,7 @@ def test_deformed_covariances_and_untouched_kernels():
     assert torch.equal(moved.means, scene.means + 1)
 
 
-def test_basis_is_orthonormal_on_the_sphere() -> None:
+def test_the_basis_is_orthonormal_with_the_signs_of_3dgs_files() -> None:
     nodes, weights = np.polynomial.legendre.leggauss(8)  # exact for the products of two functions of degree 3
     phi = np.arange(16) * 2 * math.pi / 16
     z, angle = (torch.from_numpy(v.ravel()) for v in np.meshgrid(nodes, phi, indexing="ij"))
@@ -186,9 +167,6 @@ def test_basis_is_orthonormal_on_the_sphere() -> None:
     weight = torch.from_numpy(np.repeat(weights, 16) * 2 * math.pi / 16)
     gram = torch.einsum("nb,nc,n->bc", basis, basis, weight)
     assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-12)
-
-
-def test_first_degree_follows_the_sign_convention_of_3dgs_files() -> None:
     basis = spherical_harmonics_basis(1, torch.eye(3))
     c1 = math.sqrt(3 / (4 * math.pi))
     assert torch.allclose(basis[:, 0], torch.full((3,), C0))
@@ -269,22 +247,16 @@ def hull() -> VoxelHull:
     return found
 
 
-def test_hull_of_a_sphere_holds_it_and_little_more(hull: VoxelHull) -> None:
+def test_hull_and_surface_of_a_sphere(hull: VoxelHull) -> None:
     volume = float(hull.occupied.sum()) * hull.spacing**3
     assert 0.9 < volume / (4 / 3 * torch.pi * RADIUS**3) < 1.25
     middle = hull.origin + hull.occupied.nonzero().float().mean(0) * hull.spacing
     assert torch.allclose(middle, CENTER, atol=0.02)
-
-
-def test_surface_lies_on_the_sphere_with_outward_normals(hull: VoxelHull) -> None:
     points, normals = hull.surface()
     radial = points - CENTER
     assert ((radial.norm(dim=-1) - RADIUS).abs() < 2.5 * hull.spacing).all()
     cosine = (torch.nn.functional.normalize(radial, dim=-1) * normals).sum(-1)
     assert float(cosine.min()) > 0.6 and float(cosine.mean()) > 0.93
-
-
-def test_contains_and_dilation(hull: VoxelHull) -> None:
     beyond = CENTER + torch.tensor([[0.0, 0, 0], [RADIUS + 3 * hull.spacing, 0, 0], [9.0, 9, 9], [-9.0, 0, 0]])
     assert hull.contains(beyond).tolist() == [True, False, False, False]
     grown = hull.dilated(3)
@@ -293,14 +265,7 @@ def test_contains_and_dilation(hull: VoxelHull) -> None:
     assert grown.contains(inside).all() and grown.occupied.sum() > hull.occupied.sum()
 
 
-def test_masks_that_disagree_leave_nothing() -> None:
-    viewmats, Ks = cameras_around(6)
-    masks = sphere_masks(viewmats, Ks)
-    masks[2] = False
-    assert carve(masks, viewmats, Ks, 16) is None
-
-
-def test_projection_and_search_cube() -> None:
+def test_projection_search_cube_and_masks_that_disagree() -> None:
     viewmats, Ks = cameras_around(12)
     middle, half = search_cube(viewmats, Ks, (64, 64))
     assert torch.allclose(middle, torch.zeros(3), atol=1e-4)
@@ -308,3 +273,7 @@ def test_projection_and_search_cube() -> None:
     pixels, depth = project(torch.zeros(2, 3), viewmats, Ks)
     assert torch.allclose(pixels, torch.full((12, 2, 2), 32.0), atol=1e-3)
     assert torch.allclose(depth, torch.full((12, 2), 3.0), atol=1e-4)
+    viewmats, Ks = cameras_around(6)
+    masks = sphere_masks(viewmats, Ks)
+    masks[2] = False
+    assert carve(masks, viewmats, Ks, 16) is None

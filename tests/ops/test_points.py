@@ -30,21 +30,14 @@ def _cloud(count: int = 150, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(count, 3)) * (1.0, 0.5, 2.0)
 
 
-def test_every_cluster_keeps_the_diameter_bound(diameter: float = 0.8) -> None:
-    points = _cloud()
+def test_clusters_keep_their_diameter_under_permutation_and_find_clumps() -> None:
+    points, diameter = _cloud(), 0.8
     labels = ball_clusters(points, diameter)
     assert sorted(set(labels)) == list(range(labels.max() + 1))
     assert _count(labels) < len(points)  # else the bound says nothing
     assert _widest(points, labels) <= diameter * (1 + 1e-9)
-
-
-def test_permuting_points_permutes_labels() -> None:
-    points = _cloud()
     order = np.random.default_rng(1).permutation(len(points))
-    assert np.array_equal(ball_clusters(points[order], 0.8), ball_clusters(points, 0.8)[order])
-
-
-def test_separate_clumps_are_found() -> None:
+    assert np.array_equal(ball_clusters(points[order], diameter), labels[order])
     rng = np.random.default_rng(2)
     truth = np.repeat(np.arange(4), 6)
     points = np.array([[0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5.0]])[truth] + rng.uniform(-0.1, 0.1, (24, 3))
@@ -123,11 +116,18 @@ def test_ties_go_to_the_lower_index_in_both(cap: int) -> None:
     assert torch.equal(_edges(codes, len(points)), expected)
 
 
-def test_a_distance_equal_to_the_radius_is_no_edge() -> None:
+def test_the_radius_is_open_and_may_hold_no_neighbour() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0.5, 0]])
     assert radius_edges(points, 1.0, 5).tolist() == [[2, 1], [1, 2]]
     codes = neighbour_codes(points, torch.zeros(3, dtype=torch.int64), torch.tensor([1.0]), 2)
     assert _edges(codes, 3).tolist() == [[2, 1], [1, 2]]
+    assert radius_edges(torch.rand(1, 3), 1.0, 4).shape == (2, 0)
+    assert radius_edges(torch.rand(9, 3), 1e-6, 4).shape == (2, 0)
+    assert radius_edges(torch.rand(9, 3), 1.0, 0).shape == (2, 0)
+    points, offsets, _ = _union()
+    points[3, 1] = float("nan")
+    with pytest.raises(ValueError, match="1 of 139 positions are NaN or infinite"):
+        batched_radius_edges(points, offsets, RADII, 4)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
@@ -148,19 +148,6 @@ def test_clumps_lines_and_outliers_equal_brute_force(scale: float) -> None:
             length = (points[s] - points[d]).norm(dim=1)
             rows.append(length[torch.argsort(d * 100 * scale + length)])
         torch.testing.assert_close(rows[0], rows[1], rtol=1e-5, atol=0.0)
-
-
-def test_no_neighbour_at_all() -> None:
-    assert radius_edges(torch.rand(1, 3), 1.0, 4).shape == (2, 0)
-    assert radius_edges(torch.rand(9, 3), 1e-6, 4).shape == (2, 0)
-    assert radius_edges(torch.rand(9, 3), 1.0, 0).shape == (2, 0)
-
-
-def test_positions_that_are_not_finite_are_refused() -> None:
-    points, offsets, _ = _union()
-    points[3, 1] = float("nan")
-    with pytest.raises(ValueError, match="1 of 139 positions are NaN or infinite"):
-        batched_radius_edges(points, offsets, RADII, 4)
 
 
 @pytest.mark.gpu
@@ -190,23 +177,17 @@ def selected(mask: torch.Tensor) -> list[int]:
     return mask.nonzero()[:, 0].tolist()
 
 
-def test_half_spaces(scene: GaussianScene) -> None:
+def test_half_spaces_become_masks(scene: GaussianScene) -> None:
     assert selected(HalfSpace(2, below=0.4)(scene)) == [0, 1]
     assert selected(HalfSpace(2, above=0.3)(scene)) == [2, 3]
     assert selected(HalfSpace(2, below=0.5, above=0.1)(scene)) == [1, 2]
     assert selected(parse_half_space("y=1.5")(scene)) == [0, 1]
     assert selected(parse_half_space(" above  y = 1.5 ")(scene)) == [2, 3]
-
-
-def test_masks_are_applied_and_pins_stay_within_the_simulated(scene: GaussianScene) -> None:
     marked = apply_masks(scene, simulated=HalfSpace(0, below=0.5), pinned=HalfSpace(2, below=0.3))
     assert selected(marked.simulated) == [0, 2]
     assert selected(marked.pinned) == [0]
     assert selected(apply_masks(marked, foreground=marked.pinned).pinned) == [0]
     assert selected(apply_masks(marked, simulated=HalfSpace(2, above=0.3)).pinned) == []
-
-
-def test_empty_selection_is_refused_with_the_extent(scene: GaussianScene) -> None:
     with pytest.raises(SceneError, match=r"'pinned'.*none of 4 kernels.*z 0\.\.0\.6"):
         apply_masks(scene, pinned=parse_half_space("z=-1"))
 

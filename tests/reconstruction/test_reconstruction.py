@@ -76,9 +76,8 @@ def test_stills_left_out_are_met(stills: ImageSet, fitted: GaussianScene) -> Non
 def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) -> None:
     assert 100 < fitted.count <= 160
     assert fitted.sh_degree == 1 and fitted.sh[:, 1:].abs().max() > 0
-    distance = torch.minimum(
-        (fitted.means - torch.tensor([0.1, 0, 0.5])).norm(dim=-1) - 0.3, fitted.means.norm(dim=-1) - 0.5
-    )
+    upper = (fitted.means - torch.tensor([0.1, 0, 0.5])).norm(dim=-1) - 0.3
+    distance = torch.minimum(upper, fitted.means.norm(dim=-1) - 0.5)
     assert float(distance.max()) < 0.35  # the hull of twenty masks, a fifth wider than the body, plus one voxel
     assert fitted.simulated.all() and fitted.foreground.all() and not fitted.pinned.any()
     ratio = (fitted.log_scales.amax(-1) - fitted.log_scales.amin(-1)).exp()
@@ -124,9 +123,8 @@ def shell() -> PointCloud:
 def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ROUNDS, "scene", 6)  # more would need more steps
     photos = walled(stills)
-    options = ReconstructionOptions(
-        kernels=1000, iterations=250, extent="scene", minimum_opacity=0.01, anisotropy_limit=10.0
-    )
+    settings = {"kernels": 1000, "iterations": 250, "extent": "scene"}
+    options = ReconstructionOptions(**settings, minimum_opacity=0.01, anisotropy_limit=10.0)
     train, left_out = photos.select(range(20)), photos.select(range(20, 24))
     scene = reconstruct([train], RENDERER, options, cloud=shell())
     figures = measure(scene, RENDERER, left_out)
@@ -150,9 +148,8 @@ def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
 def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
     half = reduced(replace(stills, weight=0.3), 0.5)
     assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.weight == 0.3
-    large, small = (
-        draw_still(RENDERER, true_scene(), cameras).rgb[0].clamp(0, 1) for cameras in (stills.cameras, half.cameras)
-    )
+    drawn = (draw_still(RENDERER, true_scene(), cameras) for cameras in (stills.cameras, half.cameras))
+    large, small = (images.rgb[0].clamp(0, 1) for images in drawn)
     large = large.reshape(24, SIZE // 2, 2, SIZE // 2, 2, 3).mean((2, 4))
     alpha = half.images[..., 3:].float() / 255
     assert (half.images[..., :3].float() / 255 * alpha - large).abs().max() < 0.02

@@ -55,13 +55,18 @@ def test_threads_change_no_bit(inputs: Callable) -> None:
     assert all(torch.equal(a, b) for a, b in zip(again_gradients, gradients, strict=True))
 
 
-def test_input_changed_in_place_before_backward_is_refused(inputs: Callable) -> None:
+def test_wrong_types_options_and_changed_inputs_are_refused(inputs: Callable) -> None:
     given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
     given.colors.requires_grad_()
     images = given.draw(CpuRenderer(threads=1))
     given.means += 1
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         images.rgb.sum().backward()
+    with pytest.raises(ConfigError, match="means as float32"):
+        inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(CpuRenderer())
+    for options in ({"threads": 0}, {"near": 0.0}):
+        with pytest.raises(ConfigError, match=next(iter(options))):
+            CpuRenderer(**options)
 
 
 @pytest.mark.parametrize("name", ["means", "covars", "colors", "opacities"])
@@ -70,11 +75,3 @@ def test_numbers_that_are_not_finite_are_refused(inputs: Callable, name: str) ->
     getattr(given, name).reshape(-1)[40] = float("inf" if name == "means" else "nan")
     with pytest.raises(DivergenceError, match="1 of the Gaussians .* of state"):
         given.draw(CpuRenderer(threads=2))
-
-
-def test_wrong_type_and_options_are_refused(inputs: Callable) -> None:
-    with pytest.raises(ConfigError, match="means as float32"):
-        inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(CpuRenderer())
-    for options in ({"threads": 0}, {"near": 0.0}):
-        with pytest.raises(ConfigError, match=next(iter(options))):
-            CpuRenderer(**options)

@@ -75,9 +75,8 @@ def rasterization(
     assert viewmats.shape == (*batch, views, 4, 4) and Ks.shape == (*batch, views, 3, 3)
     assert backgrounds.shape == (*batch, views, 3)
     upper = covars.triu()
-    drawn = ReferenceRenderer(near=near_plane)(
-        means, upper + upper.mT.tril(-1), colors, opacities, viewmats, Ks, (width, height)
-    )
+    given = means, upper + upper.mT.tril(-1), colors, opacities, viewmats, Ks, (width, height)
+    drawn = ReferenceRenderer(near=near_plane)(*given)
     image = drawn.rgb + (1 - drawn.alpha)[..., None] * backgrounds[..., None, None, :]
     return image, drawn.alpha[..., None], {}
 

@@ -67,9 +67,8 @@ def test_pages_name_records(tmp_path: Path) -> None:
     save_results(tmp_path / "mine.json", results)
     assert load_results(tmp_path / "mine.json") == results
     call = 'table("mine", "o", stub="row | kind")'
-    template = (
-        f'## A {{#a}}\n{{{{ mine.minutes }}}} of {{{{ mine.of }}}}\n\n{{{{ {call} }}}}\n\n{{{{ made("mine") }}}}\n'
-    )
+    template = f"## A {{#a}}\n{{{{ mine.minutes }}}} of {{{{ mine.of }}}}\n\n{{{{ {call} }}}}\n\n"
+    template += '{{ made("mine") }}\n'
     (tmp_path / "page.md").write_text(template)
     text = page(tmp_path)
     assert "## A {#a}\n0.5 of 6\n" in text and "| a | x | 1.0 |" in text and "| row | kind | l2 |" in text

@@ -155,14 +155,11 @@ def test_errors_of_the_disk_become_named_and_others_stay(tmp_path: Path) -> None
             raise ConnectionResetError(errno.ECONNRESET, "not the disk")
 
 
-def test_another_scene_is_refused_naming_both() -> None:
+def test_weights_load_into_equal_parameters_of_the_same_scenes_only() -> None:
     check_scenes(checkpoint(), [scene()], "run/last.ckpt")
     other = replace(scene(shift=0.5), name="vase")
     with pytest.raises(RunError, match=r"run/last\.ckpt was trained on 'block'.*'vase'"):
         check_scenes(checkpoint(), [other], "run/last.ckpt")
-
-
-def test_weights_load_into_equal_parameters_only() -> None:
     module, other = nn.Linear(3, 2), nn.Linear(3, 2)
     load_weights(other, {"state_dict": module.state_dict()})
     assert torch.equal(other.weight, module.weight)

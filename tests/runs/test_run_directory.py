@@ -8,13 +8,7 @@ from gausim.runs.checkpoint import AtomicCheckpointIO
 from gausim.runs.comparison import changed_keys
 from gausim.runs.directory import RunDirectory
 
-CONFIG = {
-    "seed": 0,
-    "loss": {"balance": 0.9},
-    "trainer": {"threads": 1},
-    "plan": {"epochs": 3},
-    "output_root": "o",
-}
+CONFIG = {"seed": 0, "loss": {"balance": 0.9}, "trainer": {"threads": 1}, "plan": {"epochs": 3}, "output_root": "o"}
 
 
 def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:

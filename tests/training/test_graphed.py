@@ -18,9 +18,8 @@ from gausim.training.graphed import GraphedRollouts, _Stretch
 from gausim.training.module import GausSimModule
 
 # Every batch has free motion, where a template knows its energy.
-OBJECTIVE = Objective(
-    static_weight=0.0, backprop_steps=0, energy=EnergyLoss(weight=None, probability=1.0, frames=6, stretch=2)
-)
+ENERGY = EnergyLoss(weight=None, probability=1.0, frames=6, stretch=2)
+OBJECTIVE = Objective(static_weight=0.0, backprop_steps=0, energy=ENERGY)
 MATERIAL = partial(MaterialTemplate, modes=6)
 TEMPLATES = pytest.mark.parametrize("template", [RestTemplate, ELASTIC, MATERIAL])
 

@@ -21,10 +21,8 @@ GROUPS = ("network", "scene", "template", "initial")
 def course(plan: TrainingPlan) -> list[tuple[int, list[float]]]:
     """T and the factors of the groups at the beginning of each epoch."""
     assert plan.epochs is not None
-    return [
-        (plan.steps(e), [round(plan.rate_factor(name, plan.progress(e)), 4) for name in GROUPS])
-        for e in range(plan.epochs)
-    ]
+    rates = [[round(plan.rate_factor(n, plan.progress(e)), 4) for n in GROUPS] for e in range(plan.epochs)]
+    return [(plan.steps(e), own) for e, own in enumerate(rates)]
 
 
 def cosine(part: float) -> float:

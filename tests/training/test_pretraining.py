@@ -122,9 +122,8 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus, base
     assert amplitudes[0.25] == pytest.approx(4 * amplitudes[1.0], rel=0.2)  # bends as a spring does
     assert amplitudes[4.0] == pytest.approx(amplitudes[1.0] / 4, rel=0.2)
     last = live.frame.positions
-    assert torch.equal(
-        replay_session(open_scene(body, fps=24.0, base=base, sway=0.02), live.session()).positions[-1], last
-    )
+    again = open_scene(body, fps=24.0, base=base, sway=0.02)
+    assert torch.equal(replay_session(again, live.session()).positions[-1], last)
     assert torch.equal(replay_session(live, live.session()).positions[-1], last)  # which begins with the first material
     alone = [open_scene(body, fps=24.0, stiffness=given, sway=0.02) for given in (None, 4.0)]
     assert not torch.equal(*(live.step().positions for live in alone))  # the template without a network has one, too
@@ -150,10 +149,8 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus, base
 def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, base: Path, tmp_path: Path, capsys) -> None:
     fit, common = tmp_path / "fit", [f"data.root={corpus}", *COMMON]
     assert {row["object"] for row in csv.DictReader((base / "motion.csv").open())} == {"beam2"}
-    assert (
-        train.main(["experiment=pretrain_fit", f"init_from={base}", f"hydra.run.dir={fit}", "data.seen=6", *common])
-        == 0
-    )
+    asked = ["experiment=pretrain_fit", f"init_from={base}", f"hydra.run.dir={fit}", "data.seen=6"]
+    assert train.main([*asked, *common]) == 0
     before, after = (torch.load(run / "last.ckpt", weights_only=True)["state_dict"] for run in (base, fit))
     shared = [name for name in before if ".predictor." in name or ".template." in name]
     assert shared and all(torch.equal(before[name], after[name]) for name in shared)

@@ -82,9 +82,8 @@ def test_page_pulls_where_the_mouse_goes_and_resets(tmp_path: Path) -> None:
     with opened(Subject("a column", make_interaction(), sessions=tmp_path), tmp_path) as (viewer, page):
         live = viewer.live
         centre, end, force = drag(viewer, page)
-        seen, pulled = (
-            on_screen(viewer, viewer.placing.to_page(at)) for at in (centre, centre + torch.tensor(force.direction))
-        )
+        ends = centre, centre + torch.tensor(force.direction)
+        seen, pulled = (on_screen(viewer, viewer.placing.to_page(at)) for at in ends)
         assert force.weights > 0 and pulled[0] > seen[0], "does not pull to the right on the screen"
         page.release(*end)
         page.wait(lambda: not live.interaction.acting, 10, "letting go")

@@ -105,7 +105,7 @@ def camera() -> SimpleNamespace:
     return SimpleNamespace(wxyz=(half, -half, 0.0, 0.0), position=(0.0, -5.0, 0.0), fov=np.pi / 2, aspect=2.0)
 
 
-def test_a_rectangle_takes_what_is_seen_in_it() -> None:
+def test_a_ray_takes_the_first_kernel_and_a_rectangle_what_is_seen() -> None:
     points = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [-9.0, 0, 0], [0, 0, 2.0], [0, -9.0, 0]])
     everything = in_rectangle(points, camera(), (0.0, 0.0), (1.0, 1.0))
     assert everything.tolist() == [True, True, True, True, False]
@@ -113,9 +113,6 @@ def test_a_rectangle_takes_what_is_seen_in_it() -> None:
     assert right.tolist() == [False, True, False, False, False]
     above = in_rectangle(points, camera(), (0.4, 0.0), (0.6, 0.45))
     assert above.tolist() == [False, False, False, True, False]
-
-
-def test_a_ray_takes_the_first_kernel_it_passes() -> None:
     points = torch.tensor([[0.0, 3, 0], [0.05, 1, 0], [0.0, -2, 0], [1.0, 1, 0]])
     reach, free = torch.full((4,), 0.1), torch.ones(4, dtype=torch.bool)
     assert first_hit(points, reach, (0, 0, 0), (0, 2, 0), free) == 1
