@@ -75,8 +75,6 @@ def test_the_whole_of_a_training_is_the_sum_of_its_stages(tmp_path: Path) -> Non
     assert found["images"].value == pytest.approx(240 * found["optimiser step, per sequence"].value / 3600)
 
 
-
-
 def test_peak_counts_what_is_held_at_one_time() -> None:
     x = torch.rand(1000, requires_grad=True)
 
