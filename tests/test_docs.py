@@ -24,12 +24,24 @@ def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def test_dependencies_are_pinned() -> None:
+def test_dependencies_are_pinned_and_named_pages_and_functions_exist() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     declared = {normal(re.split(r"[^\w.-]", line)[0]) for group in groups for line in group}
     pinned = {normal(line.split("==")[0]) for line in (ROOT / "constraints.txt").read_text().splitlines()}
     assert len(declared) > 30 and declared <= pinned, declared - pinned
+    pattern = r"(?:`|::: )(gausim(?:\.\w+)+)(?:\(|`|\n)"
+    named = {name for page in PAGES for name in re.findall(pattern, page.read_text())}
+    assert len(named) > 5
+    for name in named:
+        assert pkgutil.resolve_name(name) is not None
+    named = set()
+    for entry in (ROOT / name for name in NAMES_PAGES):
+        for path in entry.rglob("*") if entry.is_dir() else [entry]:
+            if path.suffix in (".py", ".yaml", ".toml", ".md", ".cpu", ".cuda", "") and path.is_file():
+                named |= {(path, page) for page in re.findall(r"\b(?:docs|research)/[\w./-]+\.md", path.read_text())}
+    assert len(named) > 10
+    assert not {(str(path), page) for path, page in named if not (ROOT / page).is_file()}
 
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -95,24 +107,6 @@ def test_commands_and_options_of_the_pages_exist() -> None:
             text = _help(name, *(before if name == "prepare" and before != ["STAGE"] else ()))
             missing = {option for option in options if not re.search(rf"(?<![\w-]){option}(?![\w-])", text)}
             assert not missing, (page, name, missing)
-
-
-def test_modules_and_functions_named_in_the_pages_exist() -> None:
-    pattern = r"(?:`|::: )(gausim(?:\.\w+)+)(?:\(|`|\n)"
-    named = {name for page in PAGES for name in re.findall(pattern, page.read_text())}
-    assert len(named) > 5
-    for name in named:
-        assert pkgutil.resolve_name(name) is not None
-
-
-def test_pages_named_in_code_and_configurations_exist() -> None:
-    named = set()
-    for entry in (ROOT / name for name in NAMES_PAGES):
-        for path in entry.rglob("*") if entry.is_dir() else [entry]:
-            if path.suffix in (".py", ".yaml", ".toml", ".md", ".cpu", ".cuda", "") and path.is_file():
-                named |= {(path, page) for page in re.findall(r"\b(?:docs|research)/[\w./-]+\.md", path.read_text())}
-    assert len(named) > 10
-    assert not {(str(path), page) for path, page in named if not (ROOT / page).is_file()}
 
 
 def _composed(argv: list[str]) -> None:

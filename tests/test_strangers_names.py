@@ -27,15 +27,12 @@ def test_any_path_may_be_a_value(tmp_path: Path, name: str, monkeypatch) -> None
     assert config.data.root == str(tmp_path / name)
 
 
-def test_a_home_is_expanded_and_a_sweep_stays_one(tmp_path: Path, monkeypatch) -> None:
+def test_a_home_is_expanded_and_an_interpolation_refused(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "é").mkdir()
     monkeypatch.setenv("HOME", str(tmp_path))
     assert compose(quoted(["data=object", "data.root=~/é", "name=x"])).data.root == str(tmp_path / "é")
     kept = ["seed=0,1", "name='a b'", "data.sequences=[seq_000,seq_001]", "plan.epochs=3", "~logger", "data.test=null"]
     assert quoted(kept) == kept
-
-
-def test_a_path_that_is_an_interpolation_is_refused(tmp_path: Path) -> None:
     (tmp_path / "${x}").mkdir()
     with pytest.raises(ConfigError, match="Rename the folder"):
         with_data_directories([f"data={tmp_path}/${{x}}"])

@@ -10,16 +10,13 @@ from gausim.compose.data_paths import data_option, located
 from gausim.core import ConfigError, DataError
 
 
-def test_words_become_keys_of_the_data_configuration():
+def test_data_words_become_keys_and_entries_keep_what_else_they_say(tmp_path: Path) -> None:
     assert data_option([]) == {}
     assert data_option(["a"]) == {"root": "a"}
     assert data_option(["a", "root=b=c", "scene=s.ply"]) == {"root": ["a", "b=c"], "scene": "s.ply"}
     assert data_option(["odd=name"]) == {"root": "odd=name"}
     with pytest.raises(ConfigError, match="--data masks=b: masks is given twice"):
         data_option(["masks=a", "masks=b"])
-
-
-def test_entries_keep_what_else_they_say(tmp_path: Path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     own = {"root": ["/gone", {"root": "/gone/too", "selections": {"pinned": "z=0.1"}}], "names": ["x"]}
@@ -28,9 +25,6 @@ def test_entries_keep_what_else_they_say(tmp_path: Path):
     assert found["names"] == ["x"]
     with pytest.raises(DataError, match="field data.root names /gone/too"):
         located(tmp_path, {"root": [str(tmp_path / "a"), own["root"][1]]}, {})
-
-
-def test_a_scene_that_is_gone_is_named(tmp_path: Path):
     (tmp_path / "set").mkdir()
     entry = {"root": str(tmp_path / "set"), "scene": "/gone/bunny.ply"}
     own = {"root": [entry], "scene": None, "masks": None}

@@ -84,12 +84,9 @@ def test_the_papers_model_hands_on_its_network_too(toy: Path, other: Path, tmp_p
     assert shared and all(torch.equal(frozen[name], source[name]) for name in shared)
 
 
-def test_other_settings_than_those_of_the_network_are_named(joint: Path, other: Path, tmp_path: Path, capsys) -> None:
+def test_a_network_of_other_settings_is_named_and_of_another_shape_refused(joint, other, tmp_path, capsys) -> None:
     tune(other, joint, tmp_path / "centred", "model.simulator.features.centred=false")
     assert "was trained with other values of model.simulator.features.centred\n" in capsys.readouterr().out
-
-
-def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path, tmp_path: Path) -> None:
     message = (
         r"init_from: the network of .*last\.ckpt does not fit this model: predictor\.network\.decoder\.0\.bias is "
         r"of shape \(4,\) there, of shape \(8,\) here.*config\.yaml has it; what differs: "

@@ -83,15 +83,12 @@ def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> N
     assert command.main([*again, "overwrite=true"]) == 0
 
 
-def test_an_unknown_key_is_refused_and_help_needs_no_hydra(arguments: list[str], capsys) -> None:
+def test_a_wrong_key_and_a_sweep_without_m_are_refused(arguments: list[str], capsys) -> None:
     with pytest.raises(ConfigError, match="modle"):
         command.main([*arguments, "modle=gausim"])
     assert not Path("outputs").exists()
     assert command.main(["--help"]) == 0
     assert "usage: gausim train" in capsys.readouterr().out
-
-
-def test_a_sweep_by_a_single_training_is_refused(arguments: list[str]) -> None:
     with pytest.raises(ConfigError, match=r"experiment=tables/ablations: is several trainings, so add -m"):
         command.main([*arguments, "experiment=tables/ablations"])
 

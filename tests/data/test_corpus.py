@@ -14,7 +14,7 @@ from gausim.data.corpus import MANIFEST, Corpus
 SHARD, NAME = "shard_00001.safetensors", "beam2"
 
 
-def test_a_body_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_body_is_read_as_it_was_written_and_missing_files_are_named(tmp_path: Path) -> None:
     corpus = Corpus(write_corpus(tmp_path / "corpus"))
     body, written = corpus.body(2), load_file(corpus.path / SHARD)
     assert len(corpus) == 3 and body.name == NAME and body.fps == 24 and body.record.shard == SHARD
@@ -24,6 +24,12 @@ def test_a_body_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert moved.abs().max() > 0.01 and not moved[:, :, body.pinned].any()
     for field in ("rest", "scale", "stiffness", "density", "damping"):
         assert torch.equal(getattr(body, field), written[f"{NAME}.{field}"])
+    with pytest.raises(DataError, match="manifest.json: not found. Make a corpus"):
+        Corpus(tmp_path)
+    root = write_corpus(tmp_path / "corpus")
+    (root / SHARD).unlink()
+    with pytest.raises(DataError, match=f"{SHARD}: not found, though"):
+        Corpus(root)
 
 
 def changed(field: str, change: Callable[[torch.Tensor], torch.Tensor | None]) -> Callable[[Path], None]:
@@ -71,12 +77,3 @@ def test_a_damaged_manifest_is_named(tmp_path: Path, key: str, value: object, me
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
     with pytest.raises(DataError, match=re.escape(str(path)) + ".*" + message):
         Corpus(path.parent)
-
-
-def test_missing_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="manifest.json: not found. Make a corpus"):
-        Corpus(tmp_path)
-    root = write_corpus(tmp_path / "corpus")
-    (root / SHARD).unlink()
-    with pytest.raises(DataError, match=f"{SHARD}: not found, though"):
-        Corpus(root)

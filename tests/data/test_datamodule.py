@@ -57,7 +57,7 @@ def test_what_a_loader_fetched_ahead_is_not_counted_as_trained(blob: Path) -> No
     assert [batch[0].sequence_id for batch in resumed.train_dataloader()][:2] == seen[2:]
 
 
-def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -> None:
+def test_epochs_are_even_and_ranks_want_a_sequence_each() -> None:
     for epoch in range(20):
         one = sampler()
         one.set_epoch(epoch)
@@ -66,6 +66,8 @@ def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -
         assert sorted(k.sequence for b in batches for k in b) == sorted(list(range(5)) * 3)
         assert all(len({k.sequence for k in b}) == len(b) for b in batches)
         assert {k.steps for b in batches for k in b} == {plan().steps(epoch)}
+    with pytest.raises(ConfigError, match=r"plan.batch_size: .* each of the 3 ranks, got 2 .*plan.batch_size=3"):
+        sampler(batch_size=2, rank=0, world_size=3)
 
 
 @pytest.mark.parametrize("done", [0, 3, 8])
@@ -94,11 +96,6 @@ def test_ranks_divide_the_batches_of_one_rank(world: int) -> None:
         held = [share[number] for share in shares]
         assert interleave(held) == batch  # nothing twice, nothing left out
     assert [len(share[-1]) for share in shares] == {2: [2, 1], 4: [1, 1, 1, 0]}[world]
-
-
-def test_fewer_sequences_per_step_than_ranks_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"plan.batch_size: .* each of the 3 ranks, got 2 .*plan.batch_size=3"):
-        sampler(batch_size=2, rank=0, world_size=3)
 
 
 def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> None:

@@ -18,13 +18,29 @@ from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
 
 
-def test_frames_are_those_of_the_files_in_the_order_asked_for(blob: Path) -> None:
+def test_facts_true_motion_stills_and_frames_are_those_of_the_files(blob: Path) -> None:
     record = ObjectData(blob).sequences[1]
     frames = record.frames(range(4, 7), ["cam_2", "cam_0"])
     expected = [[frame_pixels(1, v, f) for v in (2, 0)] for f in (4, 5, 6)]
     assert torch.equal(frames, torch.from_numpy(np.array(expected)))
     assert record.cameras_of(["cam_2", "cam_0"]).names == ("cam_2", "cam_0")
     assert torch.equal(record.cameras_of(["cam_2"]).viewmats[0], record.cameras.viewmats[2])
+    item = ObjectData(blob)
+    assert (item.name, item.fps, item.diagonal) == ("blob", 24.0, 1.5)
+    assert (item.train_views, item.heldout_views, item.train_frames) == (VIEWS[:2], VIEWS[2:], range(16))
+    truth = item.ground_truth(item.sequences[0])
+    assert truth is not None and truth.positions.shape == (FRAMES, POINTS, 3)
+    torch.testing.assert_close(truth.positions[8], truth.rest + 8 / 64)
+    assert torch.equal(truth.rest, item.scene().means)
+    stills = ObjectData(blob).stills()
+    assert stills.images.shape == (12, 6, 8, 4) and stills.heldout == (9,) and len(stills.train) == 11
+    assert torch.equal(stills.images[5], torch.from_numpy(frame_pixels(0, 0, 5)))
+    assert torch.equal(read_stills(blob / "static" / "transforms.json").images, stills.images)
+    assert [s.name for s in ObjectData(blob, sequences=2).sequences] == ["seq_000", "seq_001"]
+    assert [s.name for s in ObjectData(blob, sequences=["seq_002"]).sequences] == ["seq_002"]
+    for wrong in (4, 0, ["seq_009"]):
+        with pytest.raises(DataError, match="asked for, it has 3"):
+            _ = ObjectData(blob, sequences=wrong).sequences
 
 
 def test_a_frame_is_decoded_once(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,37 +108,12 @@ def test_hands_that_hold_nothing_or_everything_are_refused(spoilt, away, grip, m
         ObjectData(spoilt).scene()
 
 
-def test_facts_and_true_motion(blob: Path) -> None:
-    item = ObjectData(blob)
-    assert (item.name, item.fps, item.diagonal) == ("blob", 24.0, 1.5)
-    assert (item.train_views, item.heldout_views, item.train_frames) == (VIEWS[:2], VIEWS[2:], range(16))
-    truth = item.ground_truth(item.sequences[0])
-    assert truth is not None and truth.positions.shape == (FRAMES, POINTS, 3)
-    torch.testing.assert_close(truth.positions[8], truth.rest + 8 / 64)
-    assert torch.equal(truth.rest, item.scene().means)
-
-
-def test_stills_are_split(blob: Path) -> None:
-    stills = ObjectData(blob).stills()
-    assert stills.images.shape == (12, 6, 8, 4) and stills.heldout == (9,) and len(stills.train) == 11
-    assert torch.equal(stills.images[5], torch.from_numpy(frame_pixels(0, 0, 5)))
-    assert torch.equal(read_stills(blob / "static" / "transforms.json").images, stills.images)
-
-
 @pytest.mark.parametrize("place", ["static", "sequences/seq_000"])
 def test_images_too_large_for_memory_are_refused(spoilt: Path, place: str) -> None:
     path = spoilt / place / "transforms.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"w": 1 << 62}))
     with pytest.raises(DataError, match=rf"{place}/transforms\.json: \d+ images of {1 << 62}x6 do not fit into memory"):
         _ = ObjectData(spoilt).stills() if place == "static" else ObjectData(spoilt).sequences[0]
-
-
-def test_sequences_can_be_limited(blob: Path) -> None:
-    assert [s.name for s in ObjectData(blob, sequences=2).sequences] == ["seq_000", "seq_001"]
-    assert [s.name for s in ObjectData(blob, sequences=["seq_002"]).sequences] == ["seq_002"]
-    for wrong in (4, 0, ["seq_009"]):
-        with pytest.raises(DataError, match="asked for, it has 3"):
-            _ = ObjectData(blob, sequences=wrong).sequences
 
 
 def test_composite_over_black_and_over_a_color() -> None:

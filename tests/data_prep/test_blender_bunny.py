@@ -3,12 +3,9 @@
 import io
 import json
 import os
-import signal
 import stat
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -197,38 +194,3 @@ def test_a_process_is_stopped_when_another_failed(tmp_path: Path) -> None:
         BlenderProcess(program(tmp_path / "python", code)).run({}, told, stop)
     with pytest.raises(ProcessLookupError):
         os.kill(int(heard[0]), 0)
-
-
-def real_command(mesh: Path, out: Path) -> list[str]:
-    python = os.environ.get("GAUSIM_BLENDER_PYTHON")
-    if not python:
-        pytest.skip("GAUSIM_BLENDER_PYTHON names no Python with bpy")
-    return [
-        sys.executable, "-m", "gausim.cli.main", "prepare", "blender_bunny", "--mesh", str(mesh), "--out", str(out),
-        "--up", "z", "--quick", "--sequences", "2", "--frames", "4", "--stills", "3", "--views", "2",
-        "--blender-python", python, "--workers", "1",
-    ]  # fmt: skip
-
-
-@pytest.mark.slow
-def test_blender_gives_the_same_bytes_again_even_when_killed(mesh: Path, tmp_path: Path) -> None:
-    subprocess.run(real_command(mesh, tmp_path / "first"), check=True, timeout=900)
-    assert verify(tmp_path / "first") == []
-    data = ObjectData(tmp_path / "first")
-    frames = data.sequences[0].frames(range(4))
-    assert (frames[0] != frames[2]).any()
-    truth = data.ground_truth(data.sequences[0])
-    assert truth is not None and (truth.positions[0] == truth.rest).all()
-    manifest = json.loads((tmp_path / "first" / "stage.json").read_text())
-    for entry in manifest["results"]["sequences"]:
-        assert entry["amplitude_percent"] == pytest.approx(entry["amplitude_wanted_percent"], rel=0.08)
-    process = subprocess.Popen(real_command(mesh, tmp_path / "second"))
-    work, deadline = tmp_path / ".second.blender_bunny.work", time.monotonic() + 600
-    while len(list(work.glob("sequences/*/*/[0-9]*.png"))) < 3:
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not (tmp_path / "second").exists()
-    subprocess.run(real_command(mesh, tmp_path / "second"), check=True, timeout=900)
-    assert contents(tmp_path / "second") == contents(tmp_path / "first")

@@ -341,7 +341,7 @@ def test_broken_films_are_named(tmp_path: Path, refused: Refused, suffix: str, f
 # ---- which films, and starting again
 
 
-def test_folders_are_sequences_in_natural_order(tmp_path: Path) -> None:
+def test_folders_are_sequences_and_offsets_seconds_or_frames(tmp_path: Path) -> None:
     for take in ("take_10", "take_2"):
         for camera in ("left", "right"):
             (tmp_path / take).mkdir(exist_ok=True)
@@ -349,6 +349,10 @@ def test_folders_are_sequences_in_natural_order(tmp_path: Path) -> None:
     takes = find_takes(tmp_path)
     assert [(t.name, t.source) for t in takes] == [("seq_000", "take_2"), ("seq_001", "take_10")]
     assert takes[0].labels == {"cam_0": "left", "cam_1": "right"}
+    assert offset_seconds("7.3f", 50) == pytest.approx(0.146) and offset_seconds("-0.5s", 50) == -0.5
+    for text in ("", "abc", "1e999", "nan", "7 frames"):
+        with pytest.raises(DataError, match="offset"):
+            offset_seconds(text, 25)
 
 
 @pytest.mark.parametrize(
@@ -366,10 +370,3 @@ def test_unclear_folders_are_refused(tmp_path: Path, names: tuple[str, ...], mes
         (tmp_path / name).touch()
     with pytest.raises(DataError, match=message):
         find_takes(tmp_path)
-
-
-def test_offsets_are_seconds_or_frames() -> None:
-    assert offset_seconds("7.3f", 50) == pytest.approx(0.146) and offset_seconds("-0.5s", 50) == -0.5
-    for text in ("", "abc", "1e999", "nan", "7 frames"):
-        with pytest.raises(DataError, match="offset"):
-            offset_seconds(text, 25)

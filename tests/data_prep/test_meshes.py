@@ -66,7 +66,7 @@ def test_damaged_obj(tmp_path: Path, text: str) -> None:
         read_mesh(path)
 
 
-def test_damaged_ply(tmp_path: Path) -> None:
+def test_damaged_ply_and_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, encoding = tmp_path / "bad.ply", "binary_little_endian"
     with pytest.raises(DataError, match=r"bad\.ply: .*not there"):
         read_mesh(ply(path, encoding, [(0, 1, 8)]))
@@ -75,6 +75,18 @@ def test_damaged_ply(tmp_path: Path) -> None:
         path.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"bad\.ply: "):
             read_mesh(path)
+    path = tmp_path / "m.obj"
+    flat = Mesh(POINTS * (1, 1, 0), np.array(TETRAHEDRON))
+    with pytest.raises(DataError, match="flat along its up axis 'z'"):
+        make_surface(flat, path, up="z", points=4, seed=0)
+    for vertices in (POINTS * 0, POINTS * (1, 0, 0)):
+        with pytest.raises(DataError, match="no face has an area"):
+            make_surface(Mesh(vertices, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
+    with pytest.raises(DataError, match="too large"):
+        make_surface(Mesh((POINTS - 0.5) * 3e308, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
+    monkeypatch.setattr("data_prep.blender.meshes.MOST_TRIANGLES", 5000)
+    with pytest.raises(DataError, match="Remesh"):
+        refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
 
 
 def test_surface_stands_upright_in_its_frame(tmp_path: Path) -> None:
@@ -100,18 +112,3 @@ def test_refined_surface_is_closed_and_of_the_same_volume_and_area() -> None:
         assert {tuple(e) for e in edges.tolist()} == {tuple(e[::-1]) for e in edges.tolist()}
     lengths = np.linalg.norm(np.diff(fine.vertices[edges], axis=1)[:, 0], axis=1)
     assert lengths.max() <= 0.13 and len(fine.triangles) > 100
-
-
-def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "m.obj"
-    flat = Mesh(POINTS * (1, 1, 0), np.array(TETRAHEDRON))
-    with pytest.raises(DataError, match="flat along its up axis 'z'"):
-        make_surface(flat, path, up="z", points=4, seed=0)
-    for vertices in (POINTS * 0, POINTS * (1, 0, 0)):
-        with pytest.raises(DataError, match="no face has an area"):
-            make_surface(Mesh(vertices, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
-    with pytest.raises(DataError, match="too large"):
-        make_surface(Mesh((POINTS - 0.5) * 3e308, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
-    monkeypatch.setattr("data_prep.blender.meshes.MOST_TRIANGLES", 5000)
-    with pytest.raises(DataError, match="Remesh"):
-        refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)

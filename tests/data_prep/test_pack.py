@@ -46,7 +46,7 @@ def test_a_packed_object_gives_the_same_samples(toy: Path, packed: Path) -> None
     assert torch.equal(composite(samples[0].frames)[0], composite(samples[1].frames)[0])
 
 
-def test_only_the_foreground_is_stored_and_nothing_else_is_lost(toy: Path, packed: Path) -> None:
+def test_only_the_foreground_is_stored_in_a_box_with_its_margin(toy: Path, packed: Path) -> None:
     share = json.loads((packed / "stage.json").read_text())["results"]["share"]
     assert 0.1 < share < 0.9  # the block fills most of these small images
     folder = packed / "sequences" / "seq_000"
@@ -60,9 +60,6 @@ def test_only_the_foreground_is_stored_and_nothing_else_is_lost(toy: Path, packe
     names = {str(p.relative_to(toy)) for p in toy.rglob("*") if p.is_file() and "cam_" not in str(p)}
     kept = {str(p.relative_to(packed)) for p in packed.rglob("*") if p.is_file()}
     assert {n for n in names if "transforms.json" not in n or n.startswith("static")} <= kept
-
-
-def test_the_box_holds_the_foreground_and_its_margin() -> None:
     alpha = np.zeros((3, 5, 7), np.uint8)
     assert alpha[0][bounding_box(alpha, 2)].size == 0
     alpha[1, 0, 6], alpha[2, 3, 4] = 1, 255

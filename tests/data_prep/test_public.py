@@ -100,12 +100,19 @@ def test_hands_of_phystwin(sample_of: SampleOf, tmp_path: Path) -> None:
         np.testing.assert_allclose(cloud["points"], sample.path[0], atol=1e-6)
 
 
-def test_points_that_stay_together_are_a_hand() -> None:
-    # The hands meet in the middle of their ways: only the whole way tells them apart.
+def test_pins_and_hands_are_read(tmp_path: Path) -> None:
     ways = np.stack((np.linspace(-1, 1, 9), np.linspace(1, -1, 9)))[[0, 1, 1, 0, 1]]
     noise = 0.02 * np.random.default_rng(1).standard_normal((5, 3))
     points = np.stack((ways, 0 * ways, 0 * ways), -1).transpose(1, 0, 2) + noise
     assert together(points[2:], 2).tolist() == [0, 1, 1, 0, 1] and together(points, 1).tolist() == [0] * 5
+    path = tmp_path / "pin_mask.json"
+    for text in ("[0, 3]", '{"pins": [3, 0], "name": "x"}', "[true, false, false, true]"):
+        path.write_text(text)
+        assert read_pins(path, 4).tolist() == [True, False, False, True]
+    for text in ("{}", "[1.5]", "[-1]", "[4]", "[true]", '["1"]', "nonsense"):
+        path.write_text(text)
+        with pytest.raises(DataError, match=r"pin_mask\.json"):
+            read_pins(path, 4)
 
 
 def test_stills_and_a_film_of_physdreamer(sample_of: SampleOf, tmp_path: Path) -> None:
@@ -148,17 +155,6 @@ def test_readys_layout(sample_of: SampleOf, tmp_path: Path) -> None:
         assert results["without_alpha"] == ["seq_00001", "seq_00002", "seq_00003"]
     finally:
         (toy.root / "elsewhere").rename(toy.root / "video_masks")
-
-
-def test_pins_are_numbers_or_truth_values_and_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "pin_mask.json"
-    for text in ("[0, 3]", '{"pins": [3, 0], "name": "x"}', "[true, false, false, true]"):
-        path.write_text(text)
-        assert read_pins(path, 4).tolist() == [True, False, False, True]
-    for text in ("{}", "[1.5]", "[-1]", "[4]", "[true]", '["1"]', "nonsense"):
-        path.write_text(text)
-        with pytest.raises(DataError, match=r"pin_mask\.json"):
-            read_pins(path, 4)
 
 
 def put(*place: Any, to: Any) -> Callable[[Any], Any]:

@@ -57,7 +57,7 @@ def falling(tmp_path_factory):
     return shift, results, found, (folder / "table.md").read_text()
 
 
-def test_a_falling_body_is_compared_with_rigid_flight(falling):
+def test_a_falling_body_is_compared_with_rigid_flight_and_bounces_by_formula(falling) -> None:
     _, results, found, _ = falling
     assert results.objects["toy"].reference == "ballistic"
     kinds = {entry.row: entry.kind for entry in results.table if entry.metric == "error_3d"}
@@ -67,18 +67,12 @@ def test_a_falling_body_is_compared_with_rigid_flight(falling):
     assert found["ballistic", "seen", "error_3d"] > 0.3, "it stays on the floor, the truth leaves it"
     assert found["oracle", "seen", "error_3d_ratio"] < 1e-3 and found["oracle", "seen", "track_error"] < 1e-2
     assert found["oracle", "seen", "chamfer"] < 1e-2  # [1e-3 scene units]
-
-
-def test_bounce_is_that_of_the_formula(falling):
     shift, _, found, table = falling
     assert found["truth", "bounce", "rise"] == pytest.approx(float(shift[LANDED:, 2].max()), abs=1e-4)
     assert found["truth", "bounce", "height_error"] == 0
     assert found["truth", "bounce", "depth"] == pytest.approx(0, abs=1e-4)
     assert found["oracle", "bounce", "rise_error"] < 0.1  # [%]
     assert "### bounce" in table and "÷ ballistic" in table
-
-
-def test_errors_by_frames_ahead_begin_after_the_last_seen_frame(falling):
     _, _, found, table = falling
     ahead = {split: value for (row, split, _), value in found.items() if row == "ballistic" and split[0] == "+"}
     assert list(ahead) == ["+1", "+2", "+5"] and ahead["+1"] < 1e-3

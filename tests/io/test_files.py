@@ -25,18 +25,6 @@ def test_an_error_leaves_nothing_or_the_old_content(tmp_path: Path) -> None:
 
 
 def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path: Path) -> None:
-    kept = ["a.tmp", ".notes.tmp", "frames.bin", ".a.png.tmp.bak", "deep/.x.tmp"]
-    gone = [".last.ckpt.4711.tmp", ".0001.png.12.tmp.png"]
-    for name in [*kept, *gone, *(f"deep/{n}" for n in gone)]:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
-    remove_leftovers(tmp_path)
-    assert all((tmp_path / "deep" / name).exists() for name in gone)
-    remove_leftovers(tmp_path, deep=True)
-    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
-
-
-def test_what_replacing_leaves_when_it_is_killed_is_a_leftover(tmp_path: Path) -> None:
     for typed in (False, True):
         if (child := os.fork()) == 0:
             with replacing(tmp_path / "x.png", typed=typed) as temporary:
@@ -46,6 +34,15 @@ def test_what_replacing_leaves_when_it_is_killed_is_a_leftover(tmp_path: Path) -
     assert len(list(tmp_path.iterdir())) == 2 and not (tmp_path / "x.png").exists()
     remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == []
+    kept = ["a.tmp", ".notes.tmp", "frames.bin", ".a.png.tmp.bak", "deep/.x.tmp"]
+    gone = [".last.ckpt.4711.tmp", ".0001.png.12.tmp.png"]
+    for name in [*kept, *gone, *(f"deep/{n}" for n in gone)]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    remove_leftovers(tmp_path)
+    assert all((tmp_path / "deep" / name).exists() for name in gone)
+    remove_leftovers(tmp_path, deep=True)
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
 
 
 def test_hashes_and_json(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_other_layouts_are_read(tmp_path: Path, kind: str, layout: dict[str, obj
     assert back.simulated.all() and back.foreground.all() and not back.pinned.any()
 
 
-def test_damaged_text_is_refused(tmp_path: Path) -> None:
+def test_text_and_compressed_ply_that_are_damaged_are_refused(tmp_path: Path) -> None:
     save_scene(random_scene(), tmp_path / "good.ply", masks=False)
     plyfile.PlyData(plyfile.PlyData.read(tmp_path / "good.ply").elements, text=True).write(tmp_path / "text.ply")
     header, _, body = (tmp_path / "text.ply").read_text().partition("end_header\n")
@@ -88,6 +88,9 @@ def test_damaged_text_is_refused(tmp_path: Path) -> None:
     for changed in (rows[:-1], ["1 2"] * 7, ["x", *rows[1:]], [*rows[:-1], "x y"]):
         (tmp_path / "bad.ply").write_text(header + "end_header\n" + "\n".join(changed) + "\n")
         refuse(tmp_path / "bad.ply", "cannot be read")
+    write_compressed(tmp_path / "a.ply", 300, chunks=1)
+    with pytest.raises(SceneError, match="has 1 chunks; expected 2 chunks for 300 Gaussians"):
+        load_scene(tmp_path / "a.ply")
 
 
 def refuse(path: Path, *needles: str) -> None:
@@ -224,12 +227,6 @@ def test_compressed_ply_is_read(tmp_path: Path, count: int, sh: int, colors: boo
     assert scene.sh_degree == {0: 0, 9: 1, 45: 3}[sh]
     if sh:
         assert scene.sh[0, 1:3, 0].tolist() == pytest.approx([4.0, (191.5 / 256 - 0.5) * 8])
-
-
-def test_a_compressed_ply_without_its_chunks_is_refused(tmp_path: Path) -> None:
-    write_compressed(tmp_path / "a.ply", 300, chunks=1)
-    with pytest.raises(SceneError, match="has 1 chunks; expected 2 chunks for 300 Gaussians"):
-        load_scene(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("suffix", OTHER_FORMATS)

@@ -147,15 +147,12 @@ def test_bits_do_not_depend_on_the_number_of_threads(torch_threads: None, name: 
         assert all(a is b is None or torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def test_float32_on_the_cpu_is_what_fast_forms_take() -> None:
+def test_fast_forms_take_float32_on_the_cpu_and_can_be_switched_off() -> None:
     x = torch.ones(2)
     made: Operation[..., str] = Operation(lambda *_: "plain", "math:fabs")
     vars(made)["fast"] = lambda *_: "fast"
     assert made(x) == made(x, torch.arange(2)) == made(x.requires_grad_()) == "fast"
     assert made(x, x.double()) == made(x.to("meta")) == "plain"
-
-
-def test_fast_forms_can_be_switched_off() -> None:
     _, call, inputs = CASES["deformed_appearance-1"]
     given = [x.float() for x in inputs]
     fast, plain = (call(form, *given)[1] for form in (deformed_appearance.fast, deformed_appearance.plain))

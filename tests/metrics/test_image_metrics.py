@@ -26,15 +26,12 @@ def test_l2_of_one_changed_pixel_by_hand():
     assert ForegroundL2().per_image(prediction, target, mask).tolist() == pytest.approx([0.25, 0.0])
 
 
-def test_psnr_agrees_with_torchmetrics_per_image():
+def test_psnr_agrees_with_torchmetrics_and_sees_masked_pixels_only() -> None:
     prediction, target, mask = images()
     values = PSNR().per_image(prediction, target, mask)
     for i in range(len(values)):
         expected = peak_signal_noise_ratio(prediction[i], target[i], data_range=1.0)
         assert float(values[i]) == pytest.approx(float(expected), rel=1e-5)
-
-
-def test_foreground_psnr_looks_at_the_masked_pixels_only():
     prediction, target, mask = images()
     each = zip(prediction, target, mask, strict=True)
     expected = [-10 * math.log10(float((p[m] - t[m]).square().mean())) for p, t, m in each]

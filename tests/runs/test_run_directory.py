@@ -11,7 +11,7 @@ from gausim.runs.directory import RunDirectory
 CONFIG = {"seed": 0, "loss": {"balance": 0.9}, "trainer": {"threads": 1}, "plan": {"epochs": 3}, "output_root": "o"}
 
 
-def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
+def test_a_fresh_and_an_interrupted_run_and_changed_keys(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "a")
     with pytest.raises(RunError, match="no run here"):
         run.config()
@@ -19,9 +19,6 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
     assert run.config() == CONFIG
     AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {}}, run.checkpoint)
     assert run.prepare(CONFIG) == run.checkpoint
-
-
-def test_changed_keys_are_named_and_free_ones_are_not(tmp_path: Path) -> None:
     changed = {**CONFIG, "seed": 1, "output_root": "p", "trainer": {"threads": 2}, "plan": {"epochs": 4}}
     assert changed_keys(CONFIG, changed) == ["plan.epochs", "seed"]
     assert changed_keys(CONFIG, {**CONFIG, "extra": 1}) == ["extra"]

@@ -68,29 +68,20 @@ def test_a_rollout_ends_on_all_ranks_where_it_ends_on_one(ask: Ask, limit: float
     assert_as_one(ask("train", 2, **options), alone, 1e-9)
 
 
-def test_a_divergence_is_named_on_all_ranks(ask: Ask) -> None:
-    expected = r"training diverged at predicted step 1 of 3, sequence toy/seq_0: positions are nan"
-    found = ask("train", 2, count=3, wild=1e30)
-    assert all(expected in answer["error"] for answer in found) and found[0] == found[1]
-
-
 def test_metrics_of_an_uneven_set_are_those_of_all_of_it(ask: Ask) -> None:
     (alone,) = ask("metrics", 1, count=5)
     for ranks in (2, 4, 6):  # of six, one has no image
         assert ask("metrics", ranks, count=5) == [pytest.approx(alone, rel=1e-12)] * ranks
 
 
-def test_a_rank_that_dies_ends_the_others(ask: Ask) -> None:
+def test_ranks_that_die_fail_or_drift_apart_are_noticed(ask: Ask) -> None:
     found = ask("fail", 3)
     assert found[1] is None and all("gloo" in answer for answer in (found[0], found[2]))
-
-
-def test_what_the_first_rank_finds_the_others_hear(ask: Ask) -> None:
     value, other = ask("first", 2)
     assert value.startswith("one answer; ValueError: from ")
     assert other.startswith("one answer; RunError: rank 1: the first rank")
-
-
-def test_weights_that_drift_apart_are_noticed(ask: Ask) -> None:
     found = ask("drifted", 4)
     assert all("weights: expected the same on all ranks" in text and "ranks [2, 3]" in text for text in found)
+    expected = r"training diverged at predicted step 1 of 3, sequence toy/seq_0: positions are nan"
+    found = ask("train", 2, count=3, wild=1e30)
+    assert all(expected in answer["error"] for answer in found) and found[0] == found[1]

@@ -32,8 +32,11 @@ def test_a_run_killed_while_it_saves_equals_an_uninterrupted_one(trainings: Trai
     assert_same_run(run, toy_run)
 
 
-def test_a_run_that_is_asked_to_end_does_so_at_once(trainings: Trainings) -> None:
+def test_a_run_asked_to_end_does_so_and_a_place_that_cannot_be_written_is_named(trainings: Trainings) -> None:
     assert trainings("asked", *THREE, **killed(STEP, 2, by="SIGTERM"))[0] == -15
+    status, output = trainings("denied", "output_root=/sys/gausim")  # not even by the superuser
+    assert status == 2 and output.strip().splitlines()[-1].startswith("error: /sys/gausim"), output
+    assert "Traceback" not in output
 
 
 @pytest.mark.slow
@@ -103,12 +106,6 @@ def test_a_run_whose_time_was_up_is_not_trained_further(trainings: Trainings) ->
     finished = json.loads((run / "FINISHED").read_text())
     assert 0 < finished["epochs"] < 400 and finished["last_epoch"]["steps"] >= 1
     assert len(rows(run / "epochs.csv")) == finished["epochs"]
-
-
-def test_a_directory_that_cannot_be_written_is_named(trainings: Trainings) -> None:
-    status, output = trainings("denied", "output_root=/sys/gausim")  # not even by the superuser
-    assert status == 2 and output.strip().splitlines()[-1].startswith("error: /sys/gausim"), output
-    assert "Traceback" not in output
 
 
 @pytest.mark.slow

@@ -60,10 +60,15 @@ def alive(server: GuardedServer, **headers: str) -> bool:
         return len(client.recv(timeout=10)) > 0
 
 
-def test_serves_its_page_which_no_other_may_frame(server: GuardedServer) -> None:
+def test_serves_its_page_framed_and_shared_by_none_and_through_a_tunnel(server: GuardedServer) -> None:
     status, body, headers = get(server)
     assert status == 200 and b"<title>" in body and alive(server)
     assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert get(server, Host="localhost:9999", Origin="http://localhost:9999")[0] == 200
+    assert get(server, Host="localhost:9999", Origin=f"http://localhost:{server.get_port()}")[0] == 403
+    with dial(server) as client:
+        client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        assert client.recv(timeout=10) and server._share_tunnel is None
 
 
 @pytest.mark.parametrize("host", ["evil.example:{port}", "127.0.0.1.evil.example:{port}", "127.0.0.1:{port}@evil", ""])
@@ -84,11 +89,6 @@ def test_other_origins_get_no_websocket(server: GuardedServer, origin: str | Non
         assert get(server, Origin=origin.format(port=server.get_port()))[0] == 403
 
 
-def test_a_tunnel_with_another_port_may_come_in(server: GuardedServer) -> None:
-    assert get(server, Host="localhost:9999", Origin="http://localhost:9999")[0] == 200
-    assert get(server, Host="localhost:9999", Origin=f"http://localhost:{server.get_port()}")[0] == 403
-
-
 @pytest.mark.parametrize("path", ["/../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/assets/"])
 def test_other_paths_are_refused(server: GuardedServer, path: str) -> None:
     assert get(server, path)[:2] == (404, b"not found\n")
@@ -106,12 +106,6 @@ def test_junk_costs_the_sender_its_connection_and_nobody_else(server: GuardedSer
         assert bystander.recv(timeout=10)
         bystander.ping().wait(10)
     assert alive(server)
-
-
-def test_no_client_can_have_the_page_shared(server: GuardedServer) -> None:
-    with dial(server) as client:
-        client.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
-        assert client.recv(timeout=10) and server._share_tunnel is None
 
 
 def test_more_clients_than_are_served_are_turned_away() -> None:

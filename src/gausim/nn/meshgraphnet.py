@@ -61,7 +61,7 @@ class _JointLayer(nn.Module):
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
-    ``precision`` and ``compile`` do not change the parameters: checkpoints fit all their values.
+    ``precision`` does not change the parameters: checkpoints fit both values.
     """
 
     def __init__(
@@ -74,7 +74,6 @@ class MeshGraphNet(nn.Module):
         layers: int = 3,
         norm: str = "pre",
         precision: str = "fp32",
-        compile: bool = False,
     ) -> None:
         """Builds the network.
 
@@ -89,8 +88,6 @@ class MeshGraphNet(nn.Module):
                 encoders and decoder.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
-            compile: compile the layers at the first call, for any number of nodes and edges; needs a C++ compiler on
-                the CPU and triton on a GPU. It pays on a GPU.
 
         Raises:
             ConfigError: unknown precision or norm.
@@ -99,7 +96,7 @@ class MeshGraphNet(nn.Module):
         for name, given, known in (("precision", precision, PRECISIONS), ("norm", norm, NORMS)):
             if given not in known:
                 raise ConfigError(f"model.simulator.network.{name} is '{given}'; expected one of {', '.join(known)}.")
-        self.precision, self.compiled = precision, compile
+        self.precision = precision
         ends, layer = ("relu", _JointLayer) if norm == "joint" else ("silu", _SplitLayer)
         self.node_encoder = mlp((node_features, hidden, hidden), ends)
         self.edge_encoder = mlp((edge_features, hidden, hidden), ends)
@@ -116,19 +113,8 @@ class MeshGraphNet(nn.Module):
         with torch.autocast(device, enabled=False):
             nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
         with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
-            nodes = self._process(nodes, edges, edge_index)
+            for layer in self.processor:
+                nodes, edges = layer(nodes, edges, edge_index)
         with torch.autocast(device, enabled=False):
             result: Tensor = self.decoder(self.norm(nodes))
         return result
-
-    def _process(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
-        modules = list(self.processor)
-        # The compiler would build special variants for zero and one node or edge, so these graphs run uncompiled.
-        compiled = self.compiled and min(len(nodes), len(edges)) > 1
-        if compiled:
-            for layer in modules:
-                if layer._compiled_call_impl is None:  # all have the same code, which is compiled once
-                    layer.compile(dynamic=True)
-        for layer in modules:
-            nodes, edges = (layer if compiled else layer.forward)(nodes, edges, edge_index)
-        return nodes

@@ -276,7 +276,7 @@ def test_a_frame_may_carry_particles_far_beyond_the_nodes_where_it_began():
     assert float(v.grad[:, 0].sum()) == pytest.approx(0.5 * len(x), rel=1e-3)
 
 
-def test_substeps_keep_the_bound():
+def test_substeps_keep_the_bound_and_particles_of_a_cell_share_its_volume() -> None:
     grid = Grid(cells=64, size=1.0)
     x = lattice((0.4, 0.4, 0.4), (0.6, 0.5, 0.5), 1 / 64)
     stiff = Material(young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
@@ -288,9 +288,6 @@ def test_substeps_keep_the_bound():
     assert solver.substeps(E) in (2 * count, 2 * count - 1)
     with pytest.raises(ConfigError, match="young_modulus: expected positive"):
         solver.substeps(-E)
-
-
-def test_particles_of_a_cell_share_its_volume():
     x = torch.tensor([[0.51, 0.51, 0.51], [0.58, 0.52, 0.55], [0.65, 0.52, 0.55]])
     volume = simulation(x, Grid(cells=10, size=1.0)).particles.volume
     assert torch.allclose(volume, torch.tensor([0.5, 0.5, 1.0]) * 1e-3)
