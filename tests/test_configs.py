@@ -261,21 +261,18 @@ def test_the_configurations_of_all_jobs_are_printed(capsys: pytest.CaptureFixtur
     assert chosen == [(True, 0), (True, 1), (False, 0), (False, 1)]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("modle=gausim", "modle: unknown key. Did you mean 'model'?"),
-        ("trainer.thread=2", "trainer.thread: unknown key. Did you mean 'trainer.threads'?"),
-        ("model=gausm", "model=gausm: unknown choice. Did you mean 'gausim'?"),
-        ("data=syntetic", "data=syntetic: neither a directory nor a name of conf/data. Did you mean 'synthetic'?"),
-        ("seed=x", "seed: Value 'x' of type 'str' could not be converted to Integer."),
-        ("experiment=tables/joint", "experiment=tables/joint: is several trainings, so add -m."),
-        ("ablation=no_mass model=static",
-         "ablation=no_mass: does not fit this model, which has no key model.simulator.conserve_mass."),
-        ("ablation=joint",
-         "ablation=joint: changes nothing of this configuration, so it would repeat ablation=none."),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("words", "message"), [
+    ("modle=gausim", "modle: unknown key. Did you mean 'model'?"),
+    ("trainer.thread=2", "trainer.thread: unknown key. Did you mean 'trainer.threads'?"),
+    ("model=gausm", "model=gausm: unknown choice. Did you mean 'gausim'?"),
+    ("data=syntetic", "data=syntetic: neither a directory nor a name of conf/data. Did you mean 'synthetic'?"),
+    ("seed=x", "seed: Value 'x' of type 'str' could not be converted to Integer."),
+    ("experiment=tables/joint", "experiment=tables/joint: is several trainings, so add -m."),
+    ("ablation=no_mass model=static",
+     "ablation=no_mass: does not fit this model, which has no key model.simulator.conserve_mass."),
+    ("ablation=joint",
+     "ablation=joint: changes nothing of this configuration, so it would repeat ablation=none."),
+])  # fmt: skip
 def test_a_wrong_command_is_one_sentence_and_leaves_nothing(words, message, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     for arguments in (words.split(), ["-m", *words.split(), "name=sweep"]):
@@ -287,17 +284,14 @@ def test_a_wrong_command_is_one_sentence_and_leaves_nothing(words, message, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "os.system", "builtins.eval", "subprocess.run", "hydra.utils.get_method", "gausimulator.Evil",
-        "torch.os.system", "torch.load", "torch.hub.load", "torch.utils.collect_env.run", "torch.distributed.run.main",
-        "torch.ops.load_library", "torch.fx.graph_module._exec_with_source",
-        "torch._inductor.codecache.PyCodeCache.load", "torch.nn.modules.module.torch.load",
-        "lightning.fabric.plugins.io.torch_io.TorchCheckpointIO.load_checkpoint",
-        "gausim.runs.files.sole_writer", "gausim.io.files.write_durably", "gausim.cli.main.main", "lightning",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("target", [
+    "os.system", "builtins.eval", "subprocess.run", "hydra.utils.get_method", "gausimulator.Evil",
+    "torch.os.system", "torch.load", "torch.hub.load", "torch.utils.collect_env.run", "torch.distributed.run.main",
+    "torch.ops.load_library", "torch.fx.graph_module._exec_with_source",
+    "torch._inductor.codecache.PyCodeCache.load", "torch.nn.modules.module.torch.load",
+    "lightning.fabric.plugins.io.torch_io.TorchCheckpointIO.load_checkpoint",
+    "gausim.runs.files.sole_writer", "gausim.io.files.write_durably", "gausim.cli.main.main", "lightning",
+])  # fmt: skip
 def test_allow_list_refuses_and_names_key_and_target(target: str) -> None:
     config = OmegaConf.create({"callbacks": [{"_target_": "torch.nn.ReLU", "inner": {"_target_": target}}]})
     with pytest.raises(ConfigError) as caught:

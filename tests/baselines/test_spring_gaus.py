@@ -109,14 +109,11 @@ def swaying(method: SpringMass, speed: float = 0.01) -> SpringMass:
     return method
 
 
-@pytest.mark.parametrize(
-    ("around", "text"),
-    [
-        ({"gravity": (0.0, 0.0, -9.8)}, "'gravity'"),
-        ({"trains_gravity": True}, "'gravity' that is trained"),
-        ({"free": True, "floor": Floor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))}, "'free', a 'floor'"),
-    ],
-)
+@pytest.mark.parametrize(("around", "text"), [
+    ({"gravity": (0.0, 0.0, -9.8)}, "'gravity'"),
+    ({"trains_gravity": True}, "'gravity' that is trained"),
+    ({"free": True, "floor": Floor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))}, "'free', a 'floor'"),
+])  # fmt: skip
 def test_surroundings_that_springs_do_not_know_are_refused(around: dict[str, Any], text: str) -> None:
     scene = replace(toy_scene(), surroundings=Surroundings(**around))
     with pytest.raises(ConfigError, match=rf"spring_mass: 'toy' has {text} in its dataset.json, .*model=gausim"):

@@ -31,16 +31,13 @@ def test_epochs_walk_through_stages_with_their_windows_and_rates() -> None:
     assert [LinearSchedule(0.5).factor(i, 10) for i in (0, 5, 20)] == [1, 0.75, 0.5]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (lambda: stage(0), "iterations >= 1"),
-        (lambda: stage(frames=[3]), "frames as two numbers"),
-        (lambda: FitPlan({"only": stage()}).check({"b": []}, []), r"only\.rates: \['a'\] asked for; .* has \['b'\]"),
-        (lambda: FitPlan({"only": stage(penalties={"rough": 1.0})}).check({"a": []}, ["smooth"]), r"\['rough'\]"),
-        (lambda: FitPlan({}, round=0), "model.plan.round"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "said"), [
+    (lambda: stage(0), "iterations >= 1"),
+    (lambda: stage(frames=[3]), "frames as two numbers"),
+    (lambda: FitPlan({"only": stage()}).check({"b": []}, []), r"only\.rates: \['a'\] asked for; .* has \['b'\]"),
+    (lambda: FitPlan({"only": stage(penalties={"rough": 1.0})}).check({"a": []}, ["smooth"]), r"\['rough'\]"),
+    (lambda: FitPlan({}, round=0), "model.plan.round"),
+])  # fmt: skip
 def test_wrong_stages_are_refused(wrong: Callable[[], object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         wrong()

@@ -71,16 +71,13 @@ def test_without_a_store_the_runs_own_data_and_default_place(joint: Path) -> Non
         adapt.main(asked)
 
 
-@pytest.mark.parametrize(
-    ("asked", "error", "message"),
-    [
-        (["--frames", "1"], ConfigError, "--frames: expected at least 2"),
-        (["--frames", "9"], ConfigError, "t_max"),  # the object's training frames are 0..7
-        (["--set", "trainer.thread=1"], ConfigError, r"--set trainer\.thread=1.*thread"),
-        (["--data", "PUSHED", "--sequences", "none"], DataError, r"sequences \['none'\]"),
-        (["--data", "STRANGE"], DataError, r"holds \['stranger'\], which .* not know; it knows \['toy', 'other'\]"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "error", "message"), [
+    (["--frames", "1"], ConfigError, "--frames: expected at least 2"),
+    (["--frames", "9"], ConfigError, "t_max"),  # the object's training frames are 0..7
+    (["--set", "trainer.thread=1"], ConfigError, r"--set trainer\.thread=1.*thread"),
+    (["--data", "PUSHED", "--sequences", "none"], DataError, r"sequences \['none'\]"),
+    (["--data", "STRANGE"], DataError, r"holds \['stranger'\], which .* not know; it knows \['toy', 'other'\]"),
+])  # fmt: skip
 def test_what_does_not_fit_is_named(joint, pushed, tmp_path, asked, error, message) -> None:
     strange = tmp_path / "strange"
     strange.mkdir()

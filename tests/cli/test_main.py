@@ -65,21 +65,18 @@ def test_defects_keep_their_traceback_and_an_interrupt_has_the_shells_status(com
     assert cli.main(["fake"]) == 130
 
 
-@pytest.mark.parametrize(
-    ("error", "told"),
-    [
-        (
-            OSError(errno.ENOSPC, "No space left on device", "out/a.png"),
-            "out/a.png: No space left on device. Make room",
-        ),
-        (PermissionError(errno.EACCES, "Permission denied", "/locked"), "/locked: Permission denied. Correct the perm"),
-        (OSError(errno.EROFS, "Read-only file system", "a", None, "b"), "a -> b: Read-only file system. The disk is"),
-        (OSError(errno.ENOENT, "No such file", "/proc/.a.png.77.tmp.png"), "error: /proc/a.png: No such file. Check"),
-        (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device. Make room"),
-        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), "Save the file as UTF-8"),
-        (ValueError("two\nlines"), "two lines (ValueError). GAUSIM_DEBUG=1"),
-    ],
-)
+@pytest.mark.parametrize(("error", "told"), [
+    (
+        OSError(errno.ENOSPC, "No space left on device", "out/a.png"),
+        "out/a.png: No space left on device. Make room",
+    ),
+    (PermissionError(errno.EACCES, "Permission denied", "/locked"), "/locked: Permission denied. Correct the perm"),
+    (OSError(errno.EROFS, "Read-only file system", "a", None, "b"), "a -> b: Read-only file system. The disk is"),
+    (OSError(errno.ENOENT, "No such file", "/proc/.a.png.77.tmp.png"), "error: /proc/a.png: No such file. Check"),
+    (OSError(errno.ENOSPC, "No space left on device"), "error: No space left on device. Make room"),
+    (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), "Save the file as UTF-8"),
+    (ValueError("two\nlines"), "two lines (ValueError). GAUSIM_DEBUG=1"),
+])  # fmt: skip
 def test_errors_of_files_and_values_are_one_line(command, capsys, error: Exception, told: str) -> None:
     command(raising(error))
     assert cli.main(["fake"]) == 2

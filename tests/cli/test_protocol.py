@@ -178,17 +178,14 @@ def test_data_without_a_test_part_know_no_look(toy: Path, run: Path) -> None:
         evaluate.main([str(run), "--trials", "1"])
 
 
-@pytest.mark.parametrize(
-    ("part", "trials", "reserved", "message"),
-    [
-        ("exam", None, "seq_001", r"data\.part: expected null, development or test, got 'exam'"),
-        ("test", None, "seq_001", r"trials: expected the number of trials made on the development part .* got None"),
-        ("test", 8, "", r"sequences of any name asked for, it has 0 of the test part"),
-        (None, None, "all", r"evaluate: all sequences of the data belong to the test part\. Set data\.part=test"),
-        ("test", 8, "seq_001", ""),
-        ("development", None, "seq_001", ""),
-    ],
-)
+@pytest.mark.parametrize(("part", "trials", "reserved", "message"), [
+    ("exam", None, "seq_001", r"data\.part: expected null, development or test, got 'exam'"),
+    ("test", None, "seq_001", r"trials: expected the number of trials made on the development part .* got None"),
+    ("test", 8, "", r"sequences of any name asked for, it has 0 of the test part"),
+    (None, None, "all", r"evaluate: all sequences of the data belong to the test part\. Set data\.part=test"),
+    ("test", 8, "seq_001", ""),
+    ("development", None, "seq_001", ""),
+])  # fmt: skip
 def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(part, trials, reserved, message, toy):
     names: Any = "all" if reserved == "all" else [name for name in [reserved] if name]
     data = ReadyDataModule(toy, part=part, test={"sequences": names})

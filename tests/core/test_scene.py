@@ -39,16 +39,13 @@ def with_kernel(number: int, **changes: float) -> GaussianScene:
     return scene
 
 
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"means": 1e5}, "1 of 60 kernels are outside of the body"),
-        ({"means": -40.0}, "1 of 60 kernels are outside of the body"),
-        ({"log_scales": 80.0}, "1 of 60 kernels are larger than the body"),
-        ({"log_scales": 200.0}, "1 of 60 kernels are larger than the body"),
-        ({"log_scales": 1.0}, "1 of 60 kernels are larger than the body"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "told"), [
+    ({"means": 1e5}, "1 of 60 kernels are outside of the body"),
+    ({"means": -40.0}, "1 of 60 kernels are outside of the body"),
+    ({"log_scales": 80.0}, "1 of 60 kernels are larger than the body"),
+    ({"log_scales": 200.0}, "1 of 60 kernels are larger than the body"),
+    ({"log_scales": 1.0}, "1 of 60 kernels are larger than the body"),
+])  # fmt: skip
 def test_a_wrong_kernel_is_named_and_left_out(tmp_path: Path, caplog, capsys, changes, told: str) -> None:
     save_scene(with_kernel(7, **changes), tmp_path / "a.ply", masks=False)
     with caplog.at_level(logging.WARNING):

@@ -47,16 +47,13 @@ def truncated(root: Path) -> None:
     (root / SHARD).write_bytes((root / SHARD).read_bytes()[:-9])
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (changed("rest", lambda x: None), rf"{SHARD}: tensor '{NAME}.rest' is missing"),
-        (changed("rest", lambda x: x[:-1]), rf"{NAME}.rest' is torch.float32 \(80, 3\), expected .* \(81, 3\)"),
-        (changed("displacement", lambda x: x * torch.inf), "displacement' has values that are no finite"),
-        (changed("stiffness", lambda x: -x), "stiffness' has values that are not positive"),
-        (truncated, rf"{SHARD}: cannot be read as safetensors"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "message"), [
+    (changed("rest", lambda x: None), rf"{SHARD}: tensor '{NAME}.rest' is missing"),
+    (changed("rest", lambda x: x[:-1]), rf"{NAME}.rest' is torch.float32 \(80, 3\), expected .* \(81, 3\)"),
+    (changed("displacement", lambda x: x * torch.inf), "displacement' has values that are no finite"),
+    (changed("stiffness", lambda x: -x), "stiffness' has values that are not positive"),
+    (truncated, rf"{SHARD}: cannot be read as safetensors"),
+])  # fmt: skip
 def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     corpus = Corpus(write_corpus(tmp_path / "corpus"))
     damage(corpus.path)
@@ -65,13 +62,10 @@ def test_damaged_bodies_are_named(tmp_path: Path, damage: Callable[[Path], None]
     assert corpus.body(0).name == "beam0"  # in another shard
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("schema", "gausim.corpus/9", "field 'schema' is 'gausim.corpus/9', expected"),
-        ("bodies", [], "bodies"),
-    ],
-)
+@pytest.mark.parametrize(("key", "value", "message"), [
+    ("schema", "gausim.corpus/9", "field 'schema' is 'gausim.corpus/9', expected"),
+    ("bodies", [], "bodies"),
+])  # fmt: skip
 def test_a_damaged_manifest_is_named(tmp_path: Path, key: str, value: object, message: str) -> None:
     path = write_corpus(tmp_path / "corpus") / MANIFEST
     path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))

@@ -81,15 +81,12 @@ def test_kernels_near_a_hand_are_pinned_to_it(spoilt: Path) -> None:
     torch.testing.assert_close(pose.move(scene.means[:1], torch.tensor([0])), scene.means[:1])
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"points": np.zeros((3, 2, 3))}, "'points' is of shape"),
-        ({"points": np.full((FRAMES, 2, 3), np.nan)}, "'points' holds values that are no finite"),
-        ({"hand": np.array([0, 2])}, "'hand' has"),
-        ({"hand": np.array([0])}, "'hand' is"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "message"), [
+    ({"points": np.zeros((3, 2, 3))}, "'points' is of shape"),
+    ({"points": np.full((FRAMES, 2, 3), np.nan)}, "'points' holds values that are no finite"),
+    ({"hand": np.array([0, 2])}, "'hand' has"),
+    ({"hand": np.array([0])}, "'hand' is"),
+])  # fmt: skip
 def test_wrong_hands_are_refused(spoilt: Path, changed: dict[str, object], message: str) -> None:
     _hold(spoilt, **changed)
     with pytest.raises(DataError, match=rf"hands\.npz.*{message}"):
@@ -134,15 +131,12 @@ def _without_a_view(data: dict) -> None:
     data.update(frames=[f for f in data["frames"] if f["camera"] != "cam_1"])
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (_without_a_view, r"seq_000/transforms.json: view 'cam_1' lacks 20 of 20 frames"),
-        (lambda data: data["frames"].pop(FRAMES + 7), r"view 'cam_1' lacks 1 of 20 frames \(first: 7\)"),
-        (_moved, "camera 'cam_1' moves at frame 5"),
-        (lambda data: data.update(fps=30), "'fps' is 30, dataset.json says 24"),
-    ],
-)
+@pytest.mark.parametrize(("edit", "message"), [
+    (_without_a_view, r"seq_000/transforms.json: view 'cam_1' lacks 20 of 20 frames"),
+    (lambda data: data["frames"].pop(FRAMES + 7), r"view 'cam_1' lacks 1 of 20 frames \(first: 7\)"),
+    (_moved, "camera 'cam_1' moves at frame 5"),
+    (lambda data: data.update(fps=30), "'fps' is 30, dataset.json says 24"),
+])  # fmt: skip
 def test_wrong_cameras_of_a_sequence(spoilt: Path, edit: Callable, message: str) -> None:
     edit_json(spoilt / "sequences" / "seq_000" / "transforms.json", edit)
     with pytest.raises(DataError, match=message):
@@ -163,19 +157,16 @@ def test_wrong_images(spoilt: Path) -> None:
             record.frames(range(frame, frame + 1), ["cam_0"])
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("fps", 0, r"dataset\.json: field 'fps': expected 'float' > 0"),
-        ("views", "cam_0", r"dataset\.json: field 'views': expected 'array', got 'str'"),
-        ("train_views", ["cam_0", "cam_7"], "must be disjoint parts of 'views'"),
-        ("train_frames", [1, 16], "field 'train_frames"),
-        ("train_frames", [0, 40], "has 20 frames, dataset.json trains on"),
-        ("floor", {"point": [0, 0, 0], "normal": [0, 0, 0]}, r"dataset\.json.*'floor.normal'"),
-        ("floor", {"point": [0, 0, 0], "normal": [0, 0, 1], "friction": -1}, r"dataset\.json.*friction"),
-        ("grip", 0, r"dataset\.json.*grip"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "message"), [
+    ("fps", 0, r"dataset\.json: field 'fps': expected 'float' > 0"),
+    ("views", "cam_0", r"dataset\.json: field 'views': expected 'array', got 'str'"),
+    ("train_views", ["cam_0", "cam_7"], "must be disjoint parts of 'views'"),
+    ("train_frames", [1, 16], "field 'train_frames"),
+    ("train_frames", [0, 40], "has 20 frames, dataset.json trains on"),
+    ("floor", {"point": [0, 0, 0], "normal": [0, 0, 0]}, r"dataset\.json.*'floor.normal'"),
+    ("floor", {"point": [0, 0, 0], "normal": [0, 0, 1], "friction": -1}, r"dataset\.json.*friction"),
+    ("grip", 0, r"dataset\.json.*grip"),
+])  # fmt: skip
 def test_wrong_facts(spoilt: Path, field: str, value: object, message: str) -> None:
     surround(spoilt, **{field: value})
     with pytest.raises(DataError, match=message):

@@ -200,16 +200,13 @@ def ingested(folder: Path, out: Path, **options: Any) -> dict[str, Any]:
     return ingest(folder, out, IngestOptions(**options))["results"]["sequences"]["seq_000"]
 
 
-@pytest.mark.parametrize(
-    ("options", "messages"),
-    [
-        ("", ("audio: cam_0 (side_0.mp4): has no sound",
-              "flash: cam_0 (side_0.mp4): no flash", "--offsets")),
-        ("--sync offsets --offsets cam_1=5s", ("cam_1 (side_1.mp4) begins", "no time in common")),
-        ("--sync offsets --offsets cam_1=0 --start 5", ("after leaving out 5 s",)),
-        ("--sync offsets --offsets cam_1=1f --reference x", ("no camera 'x'",)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("options", "messages"), [
+    ("", ("audio: cam_0 (side_0.mp4): has no sound",
+          "flash: cam_0 (side_0.mp4): no flash", "--offsets")),
+    ("--sync offsets --offsets cam_1=5s", ("cam_1 (side_1.mp4) begins", "no time in common")),
+    ("--sync offsets --offsets cam_1=0 --start 5", ("after leaving out 5 s",)),
+    ("--sync offsets --offsets cam_1=1f --reference x", ("no camera 'x'",)),
+])  # fmt: skip
 def test_films_that_nothing_brings_together_are_refused(pair, refused, options, messages) -> None:
     """The camera is named, and every method says why it does not apply."""
     message = refused(pair, options)
@@ -322,12 +319,10 @@ def test_jitter_is_no_other_rate_and_slow_motion_is(tmp_path: Path) -> None:
 
 
 FAULTS: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda good: b"",
-    "noise": lambda good: bytes(range(256)) * 40,
-    "header": lambda good: good[:600],
+    "empty": lambda good: b"", "noise": lambda good: bytes(range(256)) * 40, "header": lambda good: good[:600],
     "no end": lambda good: good[: len(good) * 2 // 3],
     "middle": lambda good: good[: len(good) // 3] + bytes(len(good) // 6) + good[len(good) // 3 + len(good) // 6 :],
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("fault", "suffix"), [*((fault, ".mp4") for fault in FAULTS), ("no end", ".mkv")])
@@ -355,15 +350,12 @@ def test_folders_are_sequences_and_offsets_seconds_or_frames(tmp_path: Path) -> 
             offset_seconds(text, 25)
 
 
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        ((), "no films in it"),
-        (("a.mp4", "b/c.mp4"), "both in it and in b"),
-        (("a.mp4", "a.mov"), "name one camera"),
-        (("x/a.mp4", "x/b.mp4", "y/a.mp4"), "sequence 'y' has the cameras"),
-    ],
-)
+@pytest.mark.parametrize(("names", "message"), [
+    ((), "no films in it"),
+    (("a.mp4", "b/c.mp4"), "both in it and in b"),
+    (("a.mp4", "a.mov"), "name one camera"),
+    (("x/a.mp4", "x/b.mp4", "y/a.mp4"), "sequence 'y' has the cameras"),
+])  # fmt: skip
 def test_unclear_folders_are_refused(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)

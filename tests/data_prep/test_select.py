@@ -33,15 +33,12 @@ def test_terms_are_joined_from_left_to_right(scene: Path, tmp_path: Path) -> Non
     near = np.hypot(np.hypot(np.minimum(abs(x), abs(x - 5)), y), z) <= 0.3
     box = (abs(x) <= 1) & (abs(y) <= 0.2) & (abs(z) <= 1)
     cases = {
-        "all": np.ones(60, bool),
-        "not all or below z=0": z < 0,
+        "all": np.ones(60, bool), "not all or below z=0": z < 0,
         "below z=0.1 and above x=-0.2 or below y=-0.3": ((z < np.float32(0.1)) & (x > np.float32(-0.2))) | (y < -0.3),
         "below y=-0.3 or below z=0.1 and not box 1,-0.2,-1 -1,0.2,1": ((y < -0.3) | (z < np.float32(0.1))) & ~box,
-        f"near '{tmp_path / 'two points.txt'}' 0.3": near,
-        "component 1": np.arange(60) < 40,
-        "component 1 4,0,0": np.arange(60) >= 40,
-        "mask pinned or not not mask foreground": np.ones(60, bool),
-    }
+        f"near '{tmp_path / 'two points.txt'}' 0.3": near, "component 1": np.arange(60) < 40,
+        "component 1 4,0,0": np.arange(60) >= 40, "mask pinned or not not mask foreground": np.ones(60, bool),
+    }  # fmt: skip
     for text, expected in cases.items():
         chosen, paths = parse_selection(text)
         assert chosen(found).tolist() == expected.tolist(), text

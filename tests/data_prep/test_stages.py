@@ -41,18 +41,15 @@ class Chosen(Options):
     hidden: int = 3
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("", Chosen()),
-        ("--size 2 3 --names a,b --part 0.5 --quick", Chosen((2, 3), ("a", "b"), (), 0.5, True)),
-        ("--mark a b --mark c d", Chosen(mark=(["a", "b"], ["c", "d"]))),
-        ("--names none", Chosen()),
-        ("--part 1.5", "--part: expected 0 to 1, got 1.5"),
-        ("--part nan", "--part: expected 0 to 1, got nan"),
-        ("--size 2 0", "--size: expected at least 1, got 0"),
-    ],
-)
+@pytest.mark.parametrize(("line", "expected"), [
+    ("", Chosen()),
+    ("--size 2 3 --names a,b --part 0.5 --quick", Chosen((2, 3), ("a", "b"), (), 0.5, True)),
+    ("--mark a b --mark c d", Chosen(mark=(["a", "b"], ["c", "d"]))),
+    ("--names none", Chosen()),
+    ("--part 1.5", "--part: expected 0 to 1, got 1.5"),
+    ("--part nan", "--part: expected 0 to 1, got nan"),
+    ("--size 2 0", "--size: expected at least 1, got 0"),
+])  # fmt: skip
 def test_options_are_fields(line: str, expected: Chosen | str) -> None:
     parser = ArgumentParser()
     add_options(parser, Chosen)

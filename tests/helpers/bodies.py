@@ -38,11 +38,9 @@ def make_scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.flo
         log_scales=(torch.randn(count, 3, generator=generator, dtype=torch.float64) * 0.3 - 3).to(dtype),
         quats=torch.randn(count, 4, generator=generator, dtype=torch.float64).to(dtype),
         opacity_logits=torch.zeros(count, dtype=dtype),
-        sh=torch.randn(count, 4, 3, generator=generator, dtype=torch.float64).to(dtype),
-        simulated=simulated,
-        pinned=simulated & (means[:, 2] < 0.25),
-        name=f"column{seed}",
-    )
+        sh=torch.randn(count, 4, 3, generator=generator, dtype=torch.float64).to(dtype), simulated=simulated,
+        pinned=simulated & (means[:, 2] < 0.25), name=f"column{seed}",
+    )  # fmt: skip
 
 
 def make_model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **options: object) -> GausSim:

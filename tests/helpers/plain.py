@@ -25,12 +25,10 @@ def plain_scene(
     """Round kernels of one size and opacity; grey unless ``sh`` are given."""
     count = len(means)
     made = GaussianScene.create(
-        means=means,
-        log_scales=torch.full((count, 3), log_scale),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).clone(),
-        opacity_logits=torch.full((count,), opacity),
+        means=means, log_scales=torch.full((count, 3), log_scale),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).clone(), opacity_logits=torch.full((count,), opacity),
         sh=torch.zeros(count, 1, 3) if sh is None else sh,
-    )
+    )  # fmt: skip
     return replace(made, **fields).validated()
 
 
@@ -38,15 +36,10 @@ def random_scene(count: int = 7, degree: int = 1, *, seed: int = 0, masks: bool 
     g, number = torch.Generator().manual_seed(seed), torch.arange(count)
     chosen = {"simulated": number < count - 1, "pinned": number < 2, "foreground": number >= 2} if masks else {}
     return GaussianScene.create(
-        means=torch.randn(count, 3, generator=g),
-        log_scales=torch.randn(count, 3, generator=g) * 0.5 - 3,
-        quats=torch.randn(count, 4, generator=g),
-        opacity_logits=torch.randn(count, generator=g) * 3,
-        sh=torch.randn(count, (degree + 1) ** 2, 3, generator=g),
-        volume_scale=37.5,
-        name="scene",
-        **chosen,
-    )
+        means=torch.randn(count, 3, generator=g), log_scales=torch.randn(count, 3, generator=g) * 0.5 - 3,
+        quats=torch.randn(count, 4, generator=g), opacity_logits=torch.randn(count, generator=g) * 3,
+        sh=torch.randn(count, (degree + 1) ** 2, 3, generator=g), volume_scale=37.5, name="scene", **chosen,
+    )  # fmt: skip
 
 
 def unit_scene(count: int = 60, degree: int = 2) -> GaussianScene:

@@ -22,15 +22,10 @@ FRAMES, FIRST_UNSEEN = 60, 16
 SEQUENCES, VIEWS = ("a", "b"), ("x", "y")
 METRICS = (ImageMetricInfo("l2", "l2", 1e3, "1e-3", False), ImageMetricInfo("ssim", "SSIM", 10.0, "1e-1", True))
 CONFIG: dict[str, Any] = {
-    "data": {"root": "/data/toy", "names": None, "seed": 0},
-    "model": {"simulator": {"conserve_mass": True}},
-    "optimizer": {"network_lr": 0.001},
-    "ablation": {"name": "none"},
-    "experiment": {"name": "toy"},
-    "seed": 0,
-    "name": "toy",
-    "output_root": "out",
-}
+    "data": {"root": "/data/toy", "names": None, "seed": 0}, "model": {"simulator": {"conserve_mass": True}},
+    "optimizer": {"network_lr": 0.001}, "ablation": {"name": "none"}, "experiment": {"name": "toy"}, "seed": 0,
+    "name": "toy", "output_root": "out",
+}  # fmt: skip
 
 
 def config(ablation: str = "none", seed: int = 0, name: str = "toy") -> dict[str, Any]:

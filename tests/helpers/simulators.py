@@ -70,15 +70,10 @@ def gausim(
     }
     found = levels(radii, predicted_levels, graph_radii)
     return GausSim(
-        scenes,
-        fps,
-        hierarchy=HierarchySettings(levels=found, **given["hierarchy"]),
-        features=FeatureOptions(**given["features"]),
-        network=partial(MeshGraphNet, **given["network"]),
-        head=Head(**given["head"]),
-        rollout=RolloutSettings(**given["rollout"]),
-        **options,
-    )
+        scenes, fps, hierarchy=HierarchySettings(levels=found, **given["hierarchy"]),
+        features=FeatureOptions(**given["features"]), network=partial(MeshGraphNet, **given["network"]),
+        head=Head(**given["head"]), rollout=RolloutSettings(**given["rollout"]), **options,
+    )  # fmt: skip
 
 
 def feed(model: GausSim, deformation_gradients: Callable[..., tuple[Tensor, Tensor]]) -> None:

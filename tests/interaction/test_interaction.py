@@ -262,15 +262,12 @@ class Broken:
     def settle(self) -> None: ...
 
 
-@pytest.mark.parametrize(
-    ("how", "message"),
-    [
-        ("nan", "column: at frame 2 kernel 33 is nan diagonals from rest"),
-        ("far", "column: at frame 2 kernel 33 is .* diagonals from rest, expected at most 10"),
-        ("flat", "at frame 2 the covariance of kernel .* is not positive definite"),
-        ("inf", "at frame 2 the covariance of kernel .* is not positive definite"),
-    ],
-)
+@pytest.mark.parametrize(("how", "message"), [
+    ("nan", "column: at frame 2 kernel 33 is nan diagonals from rest"),
+    ("far", "column: at frame 2 kernel 33 is .* diagonals from rest, expected at most 10"),
+    ("flat", "at frame 2 the covariance of kernel .* is not positive definite"),
+    ("inf", "at frame 2 the covariance of kernel .* is not positive definite"),
+])  # fmt: skip
 def test_divergence_stops_until_a_reset(how, message) -> None:
     live = make_interaction(keep=None)
     live._stepper = Broken(live, how)

@@ -15,14 +15,10 @@ ENTRIES = (
     do.Entry(0, do.Force(Unit(1, 7), (0.1, 1 / 3, -2e-7), 0.30000000000000004, frames=12, name="drag")),
     do.Entry(0, do.Force(Kernels((9, 3, 4, 5, 3, 100)), (1, 0, 0), 2)),
     do.Entry(3, do.Impulse(Ball((0.1, 0.2, -0.3), 0.05), (0.0, 0.0, 1.0), 0.2)),
-    do.Entry(3, do.Wind((1.0, 1.0, 0.0), 0.5, gusts=0.25)),
-    do.Entry(4, do.Gravity((0.0, 0.0, -1.0), 1.0)),
-    do.Entry(5, do.Pin(Whole())),
-    do.Entry(8, do.Unpin()),
-    do.Entry(8, do.Release("drag")),
-    do.Entry(9, do.Release()),
+    do.Entry(3, do.Wind((1.0, 1.0, 0.0), 0.5, gusts=0.25)), do.Entry(4, do.Gravity((0.0, 0.0, -1.0), 1.0)),
+    do.Entry(5, do.Pin(Whole())), do.Entry(8, do.Unpin()), do.Entry(8, do.Release("drag")), do.Entry(9, do.Release()),
     do.Entry(20, do.Reset()),
-)
+)  # fmt: skip
 SESSION = do.ForceSession(MADE, 23.976, 20, ENTRIES, 9.81, seed=4)
 
 
@@ -56,34 +52,28 @@ def put(*path_and_value):
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (put("format", "gausim.session/9"), "field 'format': expected 'gausim.session/1', got 'gausim.session/9'"),
-        (put("steps", 10), "event 9: field 'at': expected 9 to 10, got 20"),
-        (put("made_with", "host", "x"), "madewith: Unexpected keyword argument .host."),
-        (put("events", 4, "at", 2), "event 4: field 'at': expected 3 to 20, got 2"),
-        (put("events", 0, "do", "explode"), "event 0: field 'do': expected one of force, release"),
-        (put("events", 0, "direction", [0, 0, 0]), "event 0: field 'direction': expected a vector that is not zero"),
-        (put("events", 0, "on", {"level": 1, "unit": -2}), "event 0: field 'index': expected int >= 0"),
-        (put("events", 1, "on", {"kernels": "0-999999999"}), "event 1: field 'kernels': .*at most 10000000 kernels"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (put("format", "gausim.session/9"), "field 'format': expected 'gausim.session/1', got 'gausim.session/9'"),
+    (put("steps", 10), "event 9: field 'at': expected 9 to 10, got 20"),
+    (put("made_with", "host", "x"), "madewith: Unexpected keyword argument .host."),
+    (put("events", 4, "at", 2), "event 4: field 'at': expected 3 to 20, got 2"),
+    (put("events", 0, "do", "explode"), "event 0: field 'do': expected one of force, release"),
+    (put("events", 0, "direction", [0, 0, 0]), "event 0: field 'direction': expected a vector that is not zero"),
+    (put("events", 0, "on", {"level": 1, "unit": -2}), "event 0: field 'index': expected int >= 0"),
+    (put("events", 1, "on", {"kernels": "0-999999999"}), "event 1: field 'kernels': .*at most 10000000 kernels"),
+])  # fmt: skip
 def test_wrong_fields_are_named(tmp_path: Path, change, message: str) -> None:
     with pytest.raises(DataError, match=f"bad.json: .*{message}"):
         parse_session(edited(tmp_path, change), "bad.json")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "bad.json: Input data was truncated"),
-        ("[]", "field 'format'"),
-        ("[" * 200_000, "nested too deeply"),
-        ('{"format": ' + "9" * 5000 + "}", "out of range"),
-        ('{"format": 1e999}', "out of range"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "bad.json: Input data was truncated"),
+    ("[]", "field 'format'"),
+    ("[" * 200_000, "nested too deeply"),
+    ('{"format": ' + "9" * 5000 + "}", "out of range"),
+    ('{"format": 1e999}', "out of range"),
+])  # fmt: skip
 def test_what_is_no_session_is_refused(text: str, message: str) -> None:
     with pytest.raises(DataError, match=message):
         parse_session(text, "bad.json")

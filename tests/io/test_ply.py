@@ -109,17 +109,14 @@ def test_counts_that_do_not_fit_the_data_are_refused(tmp_path: Path, change) -> 
     refuse(path)
 
 
-@pytest.mark.parametrize(
-    ("changed", "needles"),
-    [
-        *(({name: (3, bad)}, (f"property '{name}'", "vertex 3"))
-          for name, bad in (("x", np.nan), ("f_rest_4", np.inf), ("opacity", -np.inf), ("rot_3", np.nan))),
-        ({"y": (2, 1e300)}, ("property 'y'", "vertex 2")),  # beyond float32
-        ({f"rot_{i}": (5, 0.0) for i in range(4)}, ("first: number 5", "quaternion")),
-        *(({name: None}, (f"property '{name}' is missing",)) for name in ("z", "opacity")),
-        ({"f_rest_8": None}, ("8 properties 'f_rest_*'",)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changed", "needles"), [
+    *(({name: (3, bad)}, (f"property '{name}'", "vertex 3"))
+      for name, bad in (("x", np.nan), ("f_rest_4", np.inf), ("opacity", -np.inf), ("rot_3", np.nan))),
+    ({"y": (2, 1e300)}, ("property 'y'", "vertex 2")),  # beyond float32
+    ({f"rot_{i}": (5, 0.0) for i in range(4)}, ("first: number 5", "quaternion")),
+    *(({name: None}, (f"property '{name}' is missing",)) for name in ("z", "opacity")),
+    ({"f_rest_8": None}, ("8 properties 'f_rest_*'",)),
+])  # fmt: skip
 def test_wrong_values_and_properties_are_refused(tmp_path: Path, changed: dict, needles: tuple[str, ...]) -> None:
     columns = {name: value.astype(np.float64) for name, value in columns_of(random_scene()).items()}
     for name, change in changed.items():
@@ -131,17 +128,14 @@ def test_wrong_values_and_properties_are_refused(tmp_path: Path, changed: dict, 
     refuse(tmp_path / "bad.ply", *needles)
 
 
-@pytest.mark.parametrize(
-    ("content", "needle"),
-    [
-        (b"solid cube\n", "'ply'"),
-        (b"ply\nelement vertex 1\nproperty float x\nend_header\n0000", "format"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "empty"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n0", "'x'"),
-        (b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n0\n", "odd.ply"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex one\nproperty float x\nend_header\n0", "integer count"),
-    ],
-)
+@pytest.mark.parametrize(("content", "needle"), [
+    (b"solid cube\n", "'ply'"),
+    (b"ply\nelement vertex 1\nproperty float x\nend_header\n0000", "format"),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "empty"),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n0", "'x'"),
+    (b"ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n0\n", "odd.ply"),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex one\nproperty float x\nend_header\n0", "integer count"),
+])  # fmt: skip
 def test_malformed_headers_are_refused(tmp_path: Path, content: bytes, needle: str) -> None:
     (tmp_path / "odd.ply").write_bytes(content)
     refuse(tmp_path / "odd.ply", needle)

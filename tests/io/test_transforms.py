@@ -69,23 +69,20 @@ def test_what_an_entry_says_itself_wins(tmp_path: Path) -> None:
     assert read_transforms(written(tmp_path, second={"fl_x": 77.0})).cameras.Ks[:, 0, 0].tolist() == [9.0, 77.0]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"second": {"w": 21}}, r"frames\[1\]: is 21x16, frames\[0\] is 20x16"),
-        *(({"second": {"transform_matrix": np.diag([*d, 1.0]).tolist()}}, "matrix of 'a/1.png' is not a rotation")
-          for d in ((1.1, 1.1, 1.1), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0))),
-        ({"frames": []}, "field 'frames' must be a non-empty list"),
-        ({"fl_x": None, "camera_angle_x": None}, "neither field 'fl_x'"),
-        ({"fl_x": "wide"}, "field 'fl_x' must be a finite number"),
-        ({"fl_x": None, "camera_angle_x": 0}, "'camera_angle_x' must be between 0 and pi"),
-        ({"h": 0}, "fields 'w', 'h' must be positive"),
-        ({"k1": 0.02}, r"the lens is distorted \(\{'k1': 0.02\}\)"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported"),
-        ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "field 'file_path' must name an image"),
-        ({"frames": [{"file_path": "a.png", "transform_matrix": "eye"}]}, "finite 4 x 4 matrix"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"second": {"w": 21}}, r"frames\[1\]: is 21x16, frames\[0\] is 20x16"),
+    *(({"second": {"transform_matrix": np.diag([*d, 1.0]).tolist()}}, "matrix of 'a/1.png' is not a rotation")
+      for d in ((1.1, 1.1, 1.1), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0))),
+    ({"frames": []}, "field 'frames' must be a non-empty list"),
+    ({"fl_x": None, "camera_angle_x": None}, "neither field 'fl_x'"),
+    ({"fl_x": "wide"}, "field 'fl_x' must be a finite number"),
+    ({"fl_x": None, "camera_angle_x": 0}, "'camera_angle_x' must be between 0 and pi"),
+    ({"h": 0}, "fields 'w', 'h' must be positive"),
+    ({"k1": 0.02}, r"the lens is distorted \(\{'k1': 0.02\}\)"),
+    ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported"),
+    ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "field 'file_path' must name an image"),
+    ({"frames": [{"file_path": "a.png", "transform_matrix": "eye"}]}, "finite 4 x 4 matrix"),
+])  # fmt: skip
 def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     path = written(tmp_path, **changes)
     with pytest.raises(DataError, match=message) as error:
@@ -99,18 +96,15 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     assert len(read_transforms(path).frames) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "there", "found"),
-    [
-        ("a\\r.png", ["a/r.png"], "a/r.png"),
-        ("a\\r", ["a/r.jpg"], "a/r.jpg"),
-        ("./a/r", ["a/r.jpeg"], "a/r.jpeg"),
-        ("a/r.png", ["a/r.JPG"], "a/r.JPG"),
-        ("a/r.0001", ["a/r.0001.png", "a/r.0002.png"], "a/r.0001.png"),
-        ("a/r", [], "a/r.png"),
-        ("a\\r.jpg", [], "a/r.jpg"),
-    ],
-)
+@pytest.mark.parametrize(("name", "there", "found"), [
+    ("a\\r.png", ["a/r.png"], "a/r.png"),
+    ("a\\r", ["a/r.jpg"], "a/r.jpg"),
+    ("./a/r", ["a/r.jpeg"], "a/r.jpeg"),
+    ("a/r.png", ["a/r.JPG"], "a/r.JPG"),
+    ("a/r.0001", ["a/r.0001.png", "a/r.0002.png"], "a/r.0001.png"),
+    ("a/r", [], "a/r.png"),
+    ("a\\r.jpg", [], "a/r.jpg"),
+])  # fmt: skip
 def test_names_of_other_programs_find_their_image(tmp_path: Path, name: str, there: list[str], found: str) -> None:
     (tmp_path / "a").mkdir()
     for one in there:
@@ -127,17 +121,14 @@ def test_a_name_that_two_images_fit_is_refused(tmp_path: Path) -> None:
         read_transforms(written(tmp_path, second={"file_path": "a/r"}))
 
 
-@pytest.mark.parametrize(
-    ("file", "entry", "focal"),
-    [
-        ({"camera_angle_x": 2 * math.atan(10 / 80), "camera_angle_y": 2 * math.atan(8 / 120)}, {}, (80.0, 120.0)),
-        ({"fl_x": 80.0, "camera_angle_y": 2 * math.atan(8 / 90)}, {}, (80.0, 90.0)),
-        ({"camera_angle_x": 2 * math.atan(10 / 60), "fl_y": 50.0}, {}, (60.0, 50.0)),
-        ({"fl_x": 9.0, "fl_y": 9.0}, {"camera_angle_x": 2 * math.atan(10 / 70)}, (70.0, 70.0)),
-        ({"camera_angle_x": 1.0}, {"fl_x": 30.0, "fl_y": 40.0}, (30.0, 40.0)),
-        ({"fl_x": 30.0, "fl_y": 31.0}, {"camera_angle_y": 2 * math.atan(8 / 90)}, (30.0, 90.0)),
-    ],
-)
+@pytest.mark.parametrize(("file", "entry", "focal"), [
+    ({"camera_angle_x": 2 * math.atan(10 / 80), "camera_angle_y": 2 * math.atan(8 / 120)}, {}, (80.0, 120.0)),
+    ({"fl_x": 80.0, "camera_angle_y": 2 * math.atan(8 / 90)}, {}, (80.0, 90.0)),
+    ({"camera_angle_x": 2 * math.atan(10 / 60), "fl_y": 50.0}, {}, (60.0, 50.0)),
+    ({"fl_x": 9.0, "fl_y": 9.0}, {"camera_angle_x": 2 * math.atan(10 / 70)}, (70.0, 70.0)),
+    ({"camera_angle_x": 1.0}, {"fl_x": 30.0, "fl_y": 40.0}, (30.0, 40.0)),
+    ({"fl_x": 30.0, "fl_y": 31.0}, {"camera_angle_y": 2 * math.atan(8 / 90)}, (30.0, 90.0)),
+])  # fmt: skip
 def test_focal_lengths_of_all_dialects(tmp_path: Path, file, entry, focal: tuple[float, float]) -> None:
     changes = {"fl_x": None, "fl_y": None, "camera_angle_x": None, **file}
     own = {"fl_x": 9.0} if "fl_x" not in file and "camera_angle_x" not in file else {}

@@ -12,11 +12,9 @@ from gausim.ops.neighbours import radius_edges
 
 PAPER = {"output_scale": 2.0}
 CASES = {
-    "hierarchy": PAPER,
-    "kernels under the top": PAPER | {"predicted_levels": (2, 0), "graph_radii": (0.8, 0.3)},
-    "elastic": PAPER | {"template": partial(ElasticTemplate, modes=5, neighbours=6)},
-    "neural": NEURAL,
-}
+    "hierarchy": PAPER, "kernels under the top": PAPER | {"predicted_levels": (2, 0), "graph_radii": (0.8, 0.3)},
+    "elastic": PAPER | {"template": partial(ElasticTemplate, modes=5, neighbours=6)}, "neural": NEURAL,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("options", CASES.values(), ids=CASES)

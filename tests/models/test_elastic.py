@@ -18,15 +18,9 @@ from gausim.models.template.springs import neighbour_pairs
 def _scene(hierarchy: Hierarchy, *, geometric: float = 0.0, period: float = 12.0) -> ElasticScene:
     """Nine modes in double precision, linear unless told otherwise."""
     scene = ElasticScene(
-        hierarchy,
-        1,
-        modes=9,
-        neighbours=8,
-        period=period,
-        amplitude=0.02,
-        geometric=geometric,
+        hierarchy, 1, modes=9, neighbours=8, period=period, amplitude=0.02, geometric=geometric,
         solid=SolidSettings(0.15, 0.0, held_inside=False),
-    )
+    )  # fmt: skip
     return scene.double().requires_grad_(False)
 
 

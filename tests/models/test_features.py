@@ -29,16 +29,13 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return math.acos(float(a @ b) / float(np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-@pytest.mark.parametrize(
-    ("options", "coarse"),
-    [
-        (PAPER, False),
-        (PAPER, True),
-        (replace(PAPER, rest_inputs=True), False),
-        (replace(PAPER, rest_inputs=True, velocities=False), False),
-        (replace(PAPER, floor=True), False),
-    ],
-)
+@pytest.mark.parametrize(("options", "coarse"), [
+    (PAPER, False),
+    (PAPER, True),
+    (replace(PAPER, rest_inputs=True), False),
+    (replace(PAPER, rest_inputs=True, velocities=False), False),
+    (replace(PAPER, floor=True), False),
+])  # fmt: skip
 def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
     size, index = 2.0, torch.tensor([1, 0, 1, 1])
     unit, parent, template = _unit_state(0), _unit_state(1, 2), _unit_state(2)
@@ -96,12 +93,9 @@ def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(dtype: 
     unit, about = rest.clone().requires_grad_(), centre.clone().requires_grad_()
     edge_index = torch.tensor([[1, 0, 3, 2, 2, 3], [0, 1, 2, 3, 0, 0]])
     out = edge_features(
-        torch.stack((rest, unit, unit, unit)),
-        torch.stack((centre, about, about, about)),
-        edge_index,
-        torch.full((4, 1), DT, dtype=dtype),
-        PAPER,
-    )
+        torch.stack((rest, unit, unit, unit)), torch.stack((centre, about, about, about)), edge_index,
+        torch.full((4, 1), DT, dtype=dtype), PAPER,
+    )  # fmt: skip
     assert bool(torch.isfinite(out).all())
     assert float(out.detach()[:, 7:].abs().max()) <= 1 + 1e-6  # angles stay angles: they are not normalised later
     for column in range(out.shape[1]):

@@ -157,14 +157,9 @@ def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
 def test_split_and_keep_carry_parameters_and_moments() -> None:
     g = torch.Generator().manual_seed(0)
     splats = Splats(
-        torch.randn(6, 3, generator=g),
-        torch.rand(6, 3, generator=g),
-        torch.full((6,), 0.1),
-        sh_degree=1,
-        opacity=0.5,
-        rates=LearningRates(),
-        extent=1.0,
-    )
+        torch.randn(6, 3, generator=g), torch.rand(6, 3, generator=g), torch.full((6,), 0.1), sh_degree=1,
+        opacity=0.5, rates=LearningRates(), extent=1.0,
+    )  # fmt: skip
     with torch.no_grad():
         splats["log_scales"][2, 1] += 1.0
     (splats["means"] * torch.arange(1.0, 7.0)[:, None]).sum().backward()

@@ -89,13 +89,10 @@ def make_inputs(
     return Inputs(
         means=torch.randn(states, count, 3, generator=g) * spread,
         covars=covariance_from_scales(log_scales, torch.randn(states, count, 4, generator=g)),
-        colors=torch.rand(states, views, count, 3, generator=g),
-        opacities=opacities,
-        viewmats=orbit(views).float().repeat(states, 1, 1, 1),
-        Ks=intrinsics.repeat(states, views, 1, 1),
-        size=size,
+        colors=torch.rand(states, views, count, 3, generator=g), opacities=opacities,
+        viewmats=orbit(views).float().repeat(states, 1, 1, 1), Ks=intrinsics.repeat(states, views, 1, 1), size=size,
         background=torch.tensor([0.1, 0.5, 0.9]),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -127,13 +124,10 @@ def scene() -> Callable[[int, int], GaussianScene]:
             return torch.randn(*shape, generator=g, dtype=torch.float64)
 
         return GaussianScene.create(
-            means=0.3 * normal(count, 3),
-            log_scales=0.3 * normal(count, 3) - 2.5,
-            quats=normal(count, 4),
-            opacity_logits=normal(count) + 1,
-            sh=0.4 * normal(count, (degree + 1) ** 2, 3),
+            means=0.3 * normal(count, 3), log_scales=0.3 * normal(count, 3) - 2.5, quats=normal(count, 4),
+            opacity_logits=normal(count) + 1, sh=0.4 * normal(count, (degree + 1) ** 2, 3),
             foreground=torch.arange(count) % 3 > 0,
-        )
+        )  # fmt: skip
 
     return make
 

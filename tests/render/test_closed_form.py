@@ -71,11 +71,9 @@ def test_round_gaussian_on_the_axis(drawn: Drawer) -> None:
     depth, sigma, opacity = 3.0, 0.2, 0.8
     color = torch.tensor([[0.9, 0.1, 0.3]], dtype=torch.float64)
     images = drawn(
-        torch.tensor([[0, 0, depth]]),
-        sigma**2 * torch.eye(3).double()[None],
-        color,
+        torch.tensor([[0, 0, depth]]), sigma**2 * torch.eye(3).double()[None], color,
         torch.tensor([opacity], dtype=torch.float64),
-    )
+    )  # fmt: skip
     covar2d = ((FOCAL * sigma / depth) ** 2 + 0.3) * torch.eye(2, dtype=torch.float64)
     alpha = falloff(pixel_offsets(torch.tensor([12.0, 10.0]).double()), covar2d, opacity)
     assert 0.7 < float(alpha.max()) and float(alpha.min()) == 0

@@ -40,15 +40,12 @@ def test_runs_are_found_once_and_the_report_is_not_searched(sweep):
     assert [run.name for run in find_runs([sweep / "full" / "seed_1"])] == ["seed_1"]
 
 
-@pytest.mark.parametrize(
-    ("file", "text", "message"),
-    [
-        ("config.yaml", "a: [", "cannot be read as YAML"),
-        ("config.yaml", "a: !!python/object/apply:os.mkdir [boom]", "cannot be read as YAML"),
-        ("evaluation/metrics.json", '{"schema": "other"}', "schema"),
-        ("evaluation/metrics.json", '{"schema": "gausim.results/1", "run": 3}', "at `$.run`"),
-    ],
-)
+@pytest.mark.parametrize(("file", "text", "message"), [
+    ("config.yaml", "a: [", "cannot be read as YAML"),
+    ("config.yaml", "a: !!python/object/apply:os.mkdir [boom]", "cannot be read as YAML"),
+    ("evaluation/metrics.json", '{"schema": "other"}', "schema"),
+    ("evaluation/metrics.json", '{"schema": "gausim.results/1", "run": 3}', "at `$.run`"),
+])  # fmt: skip
 def test_broken_files_are_a_state_and_nothing_in_them_runs(sweep, monkeypatch, file, text, message):
     monkeypatch.chdir(sweep)
     (sweep / "full" / "seed_0" / file).write_text(text)

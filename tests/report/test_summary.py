@@ -38,16 +38,13 @@ def figures(made: ObjectCurves, row: str = "ours") -> dict[tuple[str, str, str],
     return {(e.split, e.views, e.metric): (e.value, e.deviation) for e in entries_of(made, 1) if e.row == row}
 
 
-@pytest.mark.parametrize(
-    ("frames", "first_unseen", "expected"),
-    [
-        (60, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26), "unseen_all": (16, 60)}),
-        (50, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26)}),
-        (16, 16, {"seen": (0, 16)}),
-        # The last third of a recording is one range.
-        (60, 42, {"seen": (0, 42), "unseen": (42, 60), "unseen_near": (42, 52)}),
-    ],
-)
+@pytest.mark.parametrize(("frames", "first_unseen", "expected"), [
+    (60, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26), "unseen_all": (16, 60)}),
+    (50, 16, {"seen": (0, 16), "unseen": (16, 50), "unseen_near": (16, 26)}),
+    (16, 16, {"seen": (0, 16)}),
+    # The last third of a recording is one range.
+    (60, 42, {"seen": (0, 42), "unseen": (42, 60), "unseen_near": (42, 52)}),
+])  # fmt: skip
 def test_splits(frames, first_unseen, expected):
     assert frame_splits(frames, first_unseen) == expected
 

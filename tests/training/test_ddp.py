@@ -44,15 +44,12 @@ def test_the_gradient_of_a_step_is_that_of_one_rank(ask: Ask, dtype: str, tolera
     assert_as_one(ask("train", 2, count=5, dtype=dtype, objective=ALL), alone, tolerance)
 
 
-@pytest.mark.parametrize(
-    ("ranks", "options", "tolerance"),
-    [
-        (2, {"count": 5, "times": 3, "objective": {**ALL, "backprop_steps": 2}}, 1e-9),  # steps follow each other
-        (3, {"count": 1, "times": 2, "objective": ALL}, 1e-9),  # ranks without a sequence
-        (2, {"count": 3, "objective": {"backprop_steps": 0}}, 1e-11),
-        (2, {"count": 3, "objective": {"momentum_weight": 0.0}}, 1e-11),
-    ],
-)
+@pytest.mark.parametrize(("ranks", "options", "tolerance"), [
+    (2, {"count": 5, "times": 3, "objective": {**ALL, "backprop_steps": 2}}, 1e-9),  # steps follow each other
+    (3, {"count": 1, "times": 2, "objective": ALL}, 1e-9),  # ranks without a sequence
+    (2, {"count": 3, "objective": {"backprop_steps": 0}}, 1e-11),
+    (2, {"count": 3, "objective": {"momentum_weight": 0.0}}, 1e-11),
+])  # fmt: skip
 def test_ranks_learn_what_one_does(ask: Ask, ranks: int, options: dict[str, Any], tolerance: float) -> None:
     found, alone = (ask("train", n, dtype="float64", **options) for n in (ranks, 1))
     assert_as_one(found, alone[0], tolerance)

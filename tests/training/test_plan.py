@@ -29,17 +29,14 @@ def cosine(part: float) -> float:
     return CosineSchedule(warmup=0.0, final=0.05).factor(part, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "data", "epochs", "steps", "factors"),
-    [
-        (["model=gausim"], HELD, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5), 29: cosine(29 / 30)}),
-        (["model=gausim"], FREE, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
-        (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),
-        (["model=gausim", "plan.t_start=3"], HELD, 30, {0: 3, 1: 4, 12: 15}, {15: cosine(0.5)}),
-        (["model=gausim", "plan.warm_start=null"], HELD, 60, {0: 2, 13: 15}, {30: cosine(0.5)}),
-        (["model=gausim_paper"], HELD, 25, {0: 1, 14: 15, 24: 15}, {0: 1, 15: 1, 16: 0.5, 18: 0.25, 24: 0.03125}),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "data", "epochs", "steps", "factors"), [
+    (["model=gausim"], HELD, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5), 29: cosine(29 / 30)}),
+    (["model=gausim"], FREE, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
+    (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),
+    (["model=gausim", "plan.t_start=3"], HELD, 30, {0: 3, 1: 4, 12: 15}, {15: cosine(0.5)}),
+    (["model=gausim", "plan.warm_start=null"], HELD, 60, {0: 2, 13: 15}, {30: cosine(0.5)}),
+    (["model=gausim_paper"], HELD, 25, {0: 1, 14: 15, 24: 15}, {0: 1, 15: 1, 16: 0.5, 18: 0.25, 24: 0.03125}),
+])  # fmt: skip
 def test_t_and_rates_of_every_recipe(overrides, data, epochs, steps, factors) -> None:
     plan: TrainingPlan = instantiate(compose(overrides).plan).resolved(data)
     found = course(plan)
@@ -72,16 +69,13 @@ def test_batches_and_limits_follow_the_data() -> None:
     assert timed.time_fraction(3.0) == 1 and TrainingPlan().time_fraction(1e9) == 0
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"epochs": 0}, r"plan\.epochs: expected at least 1"),
-        ({"t_start": 5, "t_max": 4}, r"t_start <= t_max"),
-        ({"schedule": "moon"}, r"plan\.schedule: expected cosine, halving or null"),
-        ({"clock": "moon"}, r"clock wall or cpu"),
-        ({"max_minutes": 0.0}, r"max_minutes > 0"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "message"), [
+    ({"epochs": 0}, r"plan\.epochs: expected at least 1"),
+    ({"t_start": 5, "t_max": 4}, r"t_start <= t_max"),
+    ({"schedule": "moon"}, r"plan\.schedule: expected cosine, halving or null"),
+    ({"clock": "moon"}, r"clock wall or cpu"),
+    ({"max_minutes": 0.0}, r"max_minutes > 0"),
+])  # fmt: skip
 def test_wrong_plans_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         TrainingPlan(**wrong)
@@ -110,12 +104,8 @@ def test_a_saved_configuration_states_what_ran(start, toy, tmp_path, monkeypatch
     monkeypatch.setattr(GausSimModule, "training_step", watched)
     quick = [x for x in SMALLEST if "warm_start" not in x]
     more = [
-        "model.simulator.template.modes=6",
-        "render=cpu",
-        "logger=none",
-        "trainer.motion_epochs=0",
-        "plan.repeats=1",
-    ]
+        "model.simulator.template.modes=6", "render=cpu", "logger=none", "trainer.motion_epochs=0", "plan.repeats=1",
+    ]  # fmt: skip
     common = [f"data.root={toy}", "model=gausim", *quick, *more, *start, "plan.epochs=3", f"hydra.run.dir={tmp_path}"]
     assert train.main(common) == 0
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())

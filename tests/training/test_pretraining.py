@@ -216,13 +216,9 @@ def test_a_pure_network_is_pretrained_on_single_steps_from_true_states(corpus: P
     small = [word for word in SMALL if "template" not in word and "plan.t_" not in word]
     words = ["experiment=pretrain", "model=gausim_network", f"data.root={corpus}", *small, "plan.epochs=1"]
     steps = [
-        "plan.t_start=1",
-        "plan.t_max=1",
-        "plan.repeats=1",
-        "loss.rest_image_weight=0",
-        "trainer.progress=false",
+        "plan.t_start=1", "plan.t_max=1", "plan.repeats=1", "loss.rest_image_weight=0", "trainer.progress=false",
         "trainer.motion_epochs=0",
-    ]
+    ]  # fmt: skip
     module, data = build(compose([*words, *steps]))
     assert module.plan.teach is None and data.knows_material
     assert all(bool((own == 0).all()) for own in module.model.attributes)  # what it decodes is learned
