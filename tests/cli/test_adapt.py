@@ -1,5 +1,7 @@
 """`gausim adapt`: initial states of new sequences, everything else bit by bit as the run has it."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from helpers.toy_runs import rows
 
 from gausim.cli import adapt, simulate
 from gausim.compose.build import load_run
+from gausim.compose.data_paths import data_option, located
 from gausim.core import ConfigError, DataError, RunError
 from gausim.results.table import load_results
 
@@ -86,3 +89,25 @@ def test_what_does_not_fit_is_named(joint, pushed, tmp_path, asked, error, messa
     words = [{"PUSHED": str(pushed), "STRANGE": str(strange)}.get(word, word) for word in asked]
     with pytest.raises(error, match=message):
         adapt.main([str(joint), "--frames", "3", "--epochs", "1", "--out", str(tmp_path / "out"), *words])
+
+
+def test_data_words_become_keys_and_entries_keep_what_else_they_say(tmp_path: Path) -> None:
+    assert data_option([]) == {}
+    assert data_option(["a"]) == {"root": "a"}
+    assert data_option(["a", "root=b=c", "scene=s.ply"]) == {"root": ["a", "b=c"], "scene": "s.ply"}
+    assert data_option(["odd=name"]) == {"root": "odd=name"}
+    with pytest.raises(ConfigError, match="--data masks=b: masks is given twice"):
+        data_option(["masks=a", "masks=b"])
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    own = {"root": ["/gone", {"root": "/gone/too", "selections": {"pinned": "z=0.1"}}], "names": ["x"]}
+    found = located(tmp_path, own, data_option([str(tmp_path / "a"), str(tmp_path / "b")]))
+    assert found["root"] == [str(tmp_path / "a"), {"root": str(tmp_path / "b"), "selections": {"pinned": "z=0.1"}}]
+    assert found["names"] == ["x"]
+    with pytest.raises(DataError, match="field data.root names /gone/too"):
+        located(tmp_path, {"root": [str(tmp_path / "a"), own["root"][1]]}, {})
+    (tmp_path / "set").mkdir()
+    entry = {"root": str(tmp_path / "set"), "scene": "/gone/bunny.ply"}
+    own = {"root": [entry], "scene": None, "masks": None}
+    with pytest.raises(DataError, match=r"field data.root\[0\].scene names /gone/bunny.ply, expected a file"):
+        located(tmp_path, own, {})

@@ -1,4 +1,4 @@
-"""COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named (see also tests/fuzz)."""
+"""COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named."""
 
 import struct
 import tracemalloc

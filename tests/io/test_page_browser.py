@@ -1,4 +1,4 @@
-"""The page that simulates an object, in a real browser: its frames are those of Python, and nobody breaks it."""
+"""Pages in a real browser: one simulates an object as Python does, and nobody breaks it; one plays a motion."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ import pytest
 import torch
 from helpers.bodies import NEURAL, make_model, make_scene
 from helpers.chromium import Page, chromium, needs_chromium
+from helpers.plain import unit_motion, unit_scene
 from PIL import Image
 
 from gausim.compose.page import body_page
 from gausim.core import DataError, Trajectory
 from gausim.core.state import SimState, initial_sway
 from gausim.io.page import Start, save_page
+from gausim.io.player import save_player
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.ops.orbit import orbit_cameras
@@ -213,3 +215,45 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="'rest'"):
         write(model, tmp_path / "p.html")
     assert not (tmp_path / "p.html").exists()
+
+
+WINDOW = (480, 320)
+
+
+def shown(page: Page, time: float) -> np.ndarray:
+    """The picture at a time [frames]."""
+    address = page.run(f"(player.show({time}), player.canvas.toDataURL('image/png'))")
+    with Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))) as image:
+        return np.asarray(image.convert("RGB")).astype(float)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_the_page_shows_what_our_renderer_draws_and_plays(tmp_path: Path) -> None:
+    scene = unit_scene(count=300, degree=3)
+    scene = replace(scene, sh=0.4 * scene.sh, name="toy")
+    made, background = unit_motion(scene, frames=4), torch.tensor([0.2, 0.4, 0.1])
+    camera = orbit_cameras(scene.means, azimuths=[50.0], size=WINDOW)
+    save_player(tmp_path / "m.html", scene, made, camera, background=background)
+    expected = film(ReferenceRenderer(), scene, made, camera, background=background)[:, 0].numpy().astype(float)
+    with chromium(tmp_path, size=WINDOW) as page:
+        page.open((tmp_path / "m.html").as_uri())
+        page.wait(lambda: page.run("!!window.player && player.drawn > 3"), 30, "pictures")
+        assert page.run("document.title") == "toy - gausim"
+        for frame in (0, 2, 3):
+            error = np.mean((shown(page, frame) - expected[frame]) ** 2)
+            assert 10 * np.log10(255**2 / max(error, 1e-9)) > 40, f"frame {frame}: mean square {error}"
+        between = np.mean((shown(page, 2.5) - expected[2]) ** 2)
+        assert between > 1, "nothing moves between two frames"
+        page.press_button("Play")
+        page.wait(lambda: page.run("player.playing && player.time < 2.4"), 20, "the loop's beginning")
+        page.press_button("Pause")
+        before = shown(page, 0)
+        page.drag((240, 120), (320, 120))
+        assert np.abs(shown(page, 0) - before).mean() > 1, "a drag does not turn"
+        page.press_button("View")
+        assert np.array_equal(shown(page, 0), before)
+        page.run("player.loop.checked = false, player.play(true), 0")
+        page.wait(lambda: page.run("!player.playing && player.time === 3"), 20, "the end without a loop")
+        assert not page.problems, page.problems
+        assert page.requests == [(tmp_path / "m.html").as_uri()]

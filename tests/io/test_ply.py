@@ -277,6 +277,6 @@ def test_the_reference_lists_every_kind_of_file() -> None:
     assert "refused" in others
     known = {"compressed PLY": "read", "2DGS": "refused", "point cloud": "refused", "doubles": "float32",
              "NaN": "refused", "far outside": "warning", "either byte order": "read", "normals": "read"}  # fmt: skip
-    for kind, what in known.items():  # each has its test above, or in tests/core/test_outliers.py
+    for kind, what in known.items():  # each has its test above, or in tests/core/test_scene.py
         (found,) = (text for file, text in rows.items() if kind in file)
         assert what in found, kind

@@ -1,15 +1,17 @@
 """Frames are written as numbered PLY files, whole, and never over others."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from helpers.plain import FIELDS, random_scene
+from helpers.plain import FIELDS, random_scene, unit_motion, unit_scene
 
-from gausim.core import DataError
+from gausim.core import DataError, Trajectory
 from gausim.io.ply import load_scene
 from gausim.io.ply_sequence import save_ply_sequence
+from gausim.io.trajectory import load_trajectory, save_trajectory
 
 
 def test_every_frame_is_written_exactly_with_masks_and_rate(tmp_path: Path) -> None:
@@ -31,3 +33,18 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds 'a_0001.ply' already"):
         save_ply_sequence(tmp_path / "s", "a", [random_scene(20)], 24.0)
     assert save_ply_sequence(tmp_path / "s", "b", [random_scene(20)], 24.0)
+
+
+def trajectory() -> Trajectory:
+    return replace(unit_motion(unit_scene(), frames=4, units=3), fps=30000 / 1001)
+
+
+def test_round_trip_is_bitwise(tmp_path):
+    original = trajectory()
+    save_trajectory(tmp_path / "a" / "t.safetensors", original, facts={"object": "bunny"})
+    loaded = load_trajectory(tmp_path / "a" / "t.safetensors")
+    for name in ("positions", "deformation_gradients", "rotations", "unit_of_kernel"):
+        first, second = getattr(original, name), getattr(loaded, name)
+        assert first.dtype == second.dtype and torch.equal(first, second)
+    assert loaded.fps == original.fps
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["t.safetensors"]

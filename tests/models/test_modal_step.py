@@ -1,13 +1,17 @@
 """The step of the modes and their springs: its solution, its energy, and how forces move it."""
 
+from __future__ import annotations
+
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from helpers.bodies import NEURAL, neural_model
 
 from gausim.core import SimState
 from gausim.models.template.material import DAMPING_GAIN, Links
+from gausim.models.template.reduced import reduced_step
 from gausim.models.template.solid import SolidSettings
 from gausim.ops.rotation import quaternion_to_matrix
 
@@ -147,3 +151,20 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it() ->
             state = SimState(step.positions, state.positions)
         assert low <= float(model.energy(batch, state, prepared)) / first <= high
     assert body.scale > 0
+
+
+@torch.no_grad()
+def test_arrays_give_energy_and_damping() -> None:
+    part = neural_model().modal_scene(0)
+    arrays, numbers = reduced_step(part)
+    z = torch.randn(3, len(part.stiffness), generator=torch.Generator().manual_seed(0)).double()
+    gradient = np.einsum("ncm,sm->snc", arrays["cells"], z.numpy()).reshape(3, -1, 3, 3)
+    small = (gradient + gradient.swapaxes(-1, -2)) / 2
+    green = small + gradient.swapaxes(-1, -2) @ gradient / 2
+    shear, bulk = arrays["moduli"].T / 2
+    whole, linear = (shear * (e**2).sum((-1, -2)) + bulk * np.trace(e, axis1=-2, axis2=-1) ** 2 for e in (green, small))
+    expected = part.nonlinear.potential(part.nonlinear.strain_state(z), part.factor)
+    np.testing.assert_allclose((whole - linear).sum(-1), expected.numpy(), rtol=1e-4)
+    again = arrays["drag"] + numbers["viscosity"] * arrays["stiffness"]
+    again = again + numbers["rate"] * (part.inertia - part.mass).numpy()
+    np.testing.assert_allclose(again, part.damping.numpy(), rtol=1e-6, atol=1e-9)
