@@ -1,13 +1,11 @@
 """Dashboards as `gausim train` uses them: names from the sweep, and no trace in what is learned."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.joint_runs import PAPER, weights
-from lightning.pytorch.loggers import WandbLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.cli import train as command
@@ -23,23 +21,6 @@ SHOWN = "trainer.panel_epochs=1"
 def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.chdir(tmp_path)
     return [f"data.root={toy}", *TINY, "trainer.log_every_n_steps=1"]
-
-
-@pytest.mark.slow  # wandb starts a process per job
-def test_a_sweep_names_its_jobs(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[dict[str, Any]] = []
-    begin = WandbLogger.__init__
-
-    def noted(self: WandbLogger, *args: Any, **options: Any) -> None:
-        given.append(options)
-        begin(self, *args, **options)
-
-    monkeypatch.setattr(WandbLogger, "__init__", noted)
-    swept = [SHOWN, "logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3", "plan.epochs=1"]
-    assert command.main(["-m", *arguments, *swept]) == 0
-    assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/no_momentum/gausim_paper"] * 2
-    assert len({g["name"] for g in given[:2]}) == 2 and all(g["name"].endswith("/seed_3") for g in given)
-    assert len(list(Path().rglob("offline-run-*"))) == 4
 
 
 def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(arguments, monkeypatch) -> None:

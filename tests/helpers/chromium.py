@@ -147,22 +147,6 @@ class Page:
         self.release(*middle)
         time.sleep(0.3)
 
-    def press_text(self, label: str, elements: str) -> None:
-        """Clicks the innermost of some elements with this text."""
-        self._click(_labelled(label, elements), label)
-
-    def press_input(self, label: str) -> None:
-        """Clicks the panel's input that stands beside this label."""
-        self._click(
-            f"(() => {{ let e = {_labelled(label, 'label, div, span')}; "
-            "while (e && !e.querySelector('input')) e = e.parentElement; return e && e.querySelector('input'); })()",
-            label,
-        )
-
-    def _click(self, element: str, label: str) -> None:
-        script = f"(() => {{ const found = {element}; if (found) found.click(); return !!found; }})()"
-        self.wait(lambda: self.run(script), 20, f"{label!r}")
-
 
 def _labelled(label: str, elements: str) -> str:
     return (

@@ -14,12 +14,10 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.losses import ImageLoss, Objective
 from gausim.models.initial_state import ModalInitialStates
-from gausim.nn.schedules import CosineSchedule
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.plan import TrainingPlan
 from gausim.training.trainer import TrainerSettings, make_trainer
 
 SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
@@ -157,18 +155,6 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
         torch.testing.assert_close(with_it[name] - without.get(name, 0), gradient, rtol=1e-3, atol=1e-4)
     others = [n for n in without if n not in names]
     assert others and all(torch.equal(without[n], with_it[n]) for n in others)
-
-
-@pytest.mark.slow
-def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
-    settings = OptimizerSettings(network_lr=3e-3, initial_lr=3e-3, clip_per_group=True)
-    parts = {"objective": Objective(backprop_steps=0, static_weight=0.0), "optimizer": settings}
-    module = real_module(hidden=16, layers=2, output_scale=0.05, rest_inputs=True, parts=parts)
-    module.plan = TrainingPlan(epochs=1, schedule=CosineSchedule(warmup=0.02))
-    losses: list[float] = []
-    batches = [[sample(0, steps=5)]] * 300
-    fit(module, batches, tmp_path, after=lambda: losses.append(module.last_stats["loss_image"]))
-    assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
 
 
 def test_decay_takes_matrices_and_initial_states_of_its_groups_and_nothing_else() -> None:

@@ -1,6 +1,5 @@
 """The viewer in a real browser: the page loads, a drag moves the object where it goes, sessions replay bit for bit."""
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,6 @@ from viser.transforms import SO3
 
 from gausim.interaction.selections import Kernels
 from gausim.interaction.session import Force, Hand, Impulse
-from gausim.ops.orbit import orbit_cameras
 from gausim.viewer.access import Access
 from gausim.viewer.app import Subject, Viewer
 
@@ -141,19 +139,3 @@ def test_page_brushes_flicks_and_takes_a_session(tmp_path: Path) -> None:
         (tmp_path / "broken.json").write_text("{")
         page.give_file(tmp_path / "broken.json")
         page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
-
-
-@pytest.mark.slow
-def test_page_looks_from_a_camera_of_the_data_set(tmp_path: Path) -> None:
-    interaction = make_interaction()
-    cameras = orbit_cameras(interaction.scene.means, azimuths=[0.0, 90.0], size=(64, 48))
-    subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
-    with opened(subject, tmp_path) as (viewer, page):
-        client = next(iter(viewer.server.get_clients().values()))
-        page.press_text("Cameras of the data set", "div, legend, span, p")
-        time.sleep(2.0)  # the folder opens slowly
-        expected = viewer.camera_panel._pose(cameras, 1)[0]
-        assert np.linalg.norm(client.camera.position - expected) > 0.5
-        page.press_input("Look from")
-        page.press_text(cameras.names[1], "[role=option]")
-        page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")

@@ -25,13 +25,16 @@ from gausim.interaction.replay import replay
 from gausim.interaction.selections import Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
 from gausim.ops.covariance import covariance_from_scales
+from gausim.ops.orbit import orbit_cameras
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+from gausim.viewer.camera_panel import CameraPanel
 from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter
 from gausim.viewer.live import Live
 from gausim.viewer.pipeline import Worker
 from gausim.viewer.pointer import Pointer, first_hit, in_rectangle
 from gausim.viewer.shown import LIVE, Take
 from gausim.viewer.splats import SIZE, Placing, half_covariances, pack
+from gausim.viewer.subject import Subject
 
 
 @pytest.fixture
@@ -303,3 +306,18 @@ def test_a_worker_takes_the_newest_item_and_outlives_an_error() -> None:
     worker.stop()
     worker.join(5)
     assert not worker.is_alive()
+
+
+def test_a_client_looks_from_the_cameras_of_the_data_set() -> None:
+    interaction, server, event = make_interaction(), MagicMock(), MagicMock()
+    placing, means = Placing.of(interaction.scene), interaction.scene.means
+    cameras = orbit_cameras(means, azimuths=[0.0, 90.0], size=(64, 48))
+    CameraPanel(server, placing, Subject("a column", interaction, cameras=cameras))
+    choice = server.gui.add_dropdown.return_value
+    choice.value = cameras.names[1]
+    asyncio.run(choice.on_update.call_args[0][0](event))
+    for number, camera in enumerate((server.initial_camera, event.client.camera)):
+        np.testing.assert_allclose(camera.position, placing.to_page(cameras.centers[number]), atol=1e-5)
+        ahead = (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position)
+        np.testing.assert_allclose(ahead, cameras.viewmats[number, 2, :3], atol=1e-5)
+        assert camera.fov == pytest.approx(2 * np.arctan(24 / float(cameras.Ks[number, 1, 1])))
