@@ -115,8 +115,8 @@ def test_frames_and_pictures_are_those_of_python(model: GausSim, tmp_path: Path)
         page.run("document.getElementById('panel').style.display = 'none'")  # the picture fills the window
         page.run("page.body.begin(page.facts.starts[0]), page.part = 1")
         for number, expected_picture in enumerate(shown):
-            page.run("for (let i = 0; i < 4; i++) page.body.step(); page.draw()")
-            page.run("page.shot = page.canvas.toDataURL(); 0")
+            four = "for (let i = 0; i < 4; i++) page.body.step(); "
+            page.run(four + "page.draw(); page.shot = page.canvas.toDataURL(); 0")
             with Image.open(io.BytesIO(base64.b64decode(page.run("page.shot").split(",")[1]))) as image:
                 seen = np.asarray(image.convert("RGB")).astype(float)
             error = np.mean((seen - expected_picture) ** 2)
