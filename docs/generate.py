@@ -21,6 +21,7 @@ from typing import Any
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 from msgspec.structs import astuple
 
 from gausim.cli.main import COMMANDS, command
@@ -34,6 +35,7 @@ from gausim.results.table import Entry, Results, load_results
 RECIPES = {"experiment": "Experiments", "ablation": "Ablations"}
 GROUPS = ("model", "data", "supervision", "render", "trainer", "logger")
 ROOT = Path(__file__).resolve().parents[1]
+LIVE = ROOT / "outputs" / "demo" / "seed_0" / "page.html"  # of `make demo`
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -44,7 +46,18 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     files.append(File.generated(config, "results/details.md", content=details(records)))
     for name, record in records.items():
         files.append(File.generated(config, f"results/{name}.csv", content=csv_of(record)))
+    if LIVE.is_file():
+        files.append(File.generated(config, "live/demo.html", abs_src_path=str(LIVE)))
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
+    """Puts the demo's page into the gallery, where `make demo` has made it."""
+    if page.file.src_uri != "gallery.md" or not LIVE.is_file():
+        return markdown
+    style = "width: 100%; height: 640px; border: 0"
+    frame = f'<iframe src="../live/demo.html" title="A learned flower" style="{style}"></iframe>'
+    return re.sub(r"(?s)<!-- live -->.*?<!-- /live -->", frame, markdown)
 
 
 def details(records: dict[str, Results]) -> str:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from gausim.cli import export
 from gausim.core import ConfigError
-from gausim.core.surroundings import Surroundings
+from gausim.core.surroundings import Floor, Surroundings
 from gausim.io.ply import load_scene, save_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import read_video
@@ -91,6 +91,22 @@ def test_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert settings["starts"][0]["frames"] > settings["starts"][0]["seen"] > 0 and settings["ceiling"] > 0
     about = dict(settings["about"])
     assert len(about["Data (SHA-256)"]) > 64 and "commit" in about["Made by"] and "Apache" in about["Licence"]
-    run.module.scenes = [replace(toy.scene, surroundings=Surroundings(free=True))]
-    with pytest.raises(ConfigError, match="falls.*--format html"):
-        export.main(command)
+    for surroundings in (Surroundings(free=True), Surroundings(floor=Floor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))):
+        run.module.scenes = [replace(toy.scene, surroundings=surroundings)]
+        with pytest.raises(ConfigError, match="falls, lies on a floor.*--format html"):
+            export.main(command)
+
+
+def test_the_page_of_a_pure_network_is_refused_with_its_products(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy = write_toy_object(tmp_path / "toy")
+    model = make_model(toy.scene, hidden=32)
+    run = stand_in(
+        tmp_path / "demo" / "seed_0", toy.root, model=model, initial_states=ModalInitialStates(model, [0, 0])
+    )
+    monkeypatch.setattr("gausim.compose.build.load_run", lambda path, **_: run)
+    weights = sum(parameter.numel() for parameter in model.parameters() if parameter.ndim == 2)
+    with pytest.raises(ConfigError, match="needs a run of model=gausim.*million products.*--format html") as refused:
+        export.main([str(run.run_dir), "--format", "page"])
+    assert float(str(refused.value).split("takes ")[1].split(" million")[0]) > weights / 1e6
