@@ -60,11 +60,11 @@ def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
 
 
 @pytest.mark.parametrize("c0", [0.02, 0.0])
-def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
+def test_matrices_are_sums_over_units(hierarchy, c0: float) -> None:
     """Against the equations of the module's text, written out unit by unit; with and without drag."""
     template, (density, attributes) = _template(hierarchy, damping=Damping(c0, 0.02)), _material(hierarchy)
     body = template.body(0)
-    units, links = template.decode(body, attributes)
+    units, _ = template.decode(body, attributes)
     found = template.matrices(0, density, attributes, 1 / 24)
     k, c1 = (2 * np.pi / 8) ** 2, 0.02
     rho = (2.5 * torch.tanh(density / 2.5)).exp()
@@ -75,11 +75,6 @@ def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
         stiffness += units[i, 0].exp() * body.stiffness[0, i] + units[i, 1].exp() * body.stiffness[1, i]
         inertia += rho[i] * own
         drag += 2 * rho[i] * lost[i] * own
-    for e in range(body.springs.ends.shape[1]):
-        stretch = 0.3 * links[e, 0].exp()
-        stiffness += stretch * torch.outer(body.stretch[e], body.stretch[e])
-        tied = 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
-        inertia, drag = inertia + tied, drag + lost[body.springs.ends[:, e]].sum() * tied
     torch.testing.assert_close(found.stiffness, k * stiffness)
     torch.testing.assert_close(found.mass, inertia)
     slowed = (found.inertia - inertia).diagonal()
@@ -89,10 +84,44 @@ def test_matrices_are_sums_over_units_and_links(hierarchy, c0: float) -> None:
     assert 0 < int((slowed > 0).sum()) < 9
     rate = drag.trace() / inertia.trace()
     torch.testing.assert_close(found.damping, drag + rate * slowed.diag() + (c1 + rate / 4) * k * stiffness)
-    assert not found.springs.any()
+    assert not len(found.springs)
     torch.testing.assert_close(found.units, k * units[:, :2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
+
+
+def test_springs_add_their_stiffness_and_no_mass(hierarchy) -> None:
+    solid, net = _template(hierarchy), _template(replace(hierarchy, law="springs"))
+    material, dt, ends = _material(hierarchy), 1 / 24, net.body(0).springs.ends
+    found = net.matrices(0, *material, dt)
+    # The same vibrations, the lowest ones, are among the modes of both laws.
+    count, k = solid.vibrations(0), (2 * np.pi / 8) ** 2
+    torch.testing.assert_close(found.mass, _masses(net.body(0), material[0]))
+    stretch = net.body(0).stretch
+    springs = stretch.mT @ (net.decode(net.body(0), material[1])[1].exp()[:, None] * stretch)
+    cells = solid.matrices(0, *material, dt).stiffness[:count, :count]
+    both = (k * springs)[:count, :count] + cells
+    torch.testing.assert_close(found.stiffness[:count, :count], both, atol=1e-4, rtol=0)
+    assert len(found.springs) == ends.shape[1] > 0
+
+
+def test_only_nets_have_matrices_of_their_own_and_stay_positive(hierarchy) -> None:
+    assert not _template(hierarchy).nets
+    net, material = _template(replace(hierarchy, law="springs")), _material(hierarchy)
+    even = net.matrices(0, *material, 1 / 24)
+    net.nets["0"].normal_(generator=torch.Generator().manual_seed(5))
+    found, (between, moved) = net.matrices(0, *material, 1 / 24), torch.eye(9).double() + 0.3 * net.nets["0"]
+    root = moved.mT @ torch.linalg.cholesky(even.stiffness) @ between
+    torch.testing.assert_close(found.stiffness, root @ root.mT, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(found.mass, moved.mT @ even.mass @ moved)
+    assert float(torch.linalg.eigvalsh(found.stiffness)[0]) > 0
+    torch.testing.assert_close(found.damping, 0.02 * found.stiffness)
+    assert net.own(0, "template.") == ("template.nets.0",)
+
+
+def _masses(body, density):
+    rho = (2.5 * torch.tanh(density / 2.5)).exp()
+    return torch.einsum("n,nal,nam->lm", rho, body.inertia, body.inertia)
 
 
 def test_without_drag_training_adds_none(hierarchy) -> None:
@@ -113,7 +142,10 @@ def test_springs_have_no_drag_and_half_the_frame_rate_is_the_same_body(hierarchy
     template, material = _template(replace(hierarchy, law="springs"), damping=Damping(0.02, 0.03)), _material(hierarchy)
     before = template.matrices(0, *material, 1 / 24)
     template.damping.fill_(1.0)
-    torch.testing.assert_close(template.matrices(0, *material, 1 / 24).damping, before.damping)
+    template.growth.fill_(1.0)
+    after = template.matrices(0, *material, 1 / 24)
+    torch.testing.assert_close(after.damping, before.damping)
+    assert after.growth == before.growth
     torch.testing.assert_close(before.damping, 0.03 * before.stiffness)
     assert not template.has_drag(0) and _template(hierarchy).has_drag(0)
     template, (density, attributes) = _template(hierarchy), _material(hierarchy)
@@ -146,7 +178,7 @@ def test_cells_or_springs_are_what_is_nonlinear(hierarchy, finite: bool) -> None
         energy = (matrices.springs * body.springs.stiffness * small.stretch[0].square()).sum()
     ratio = float(energy / (1e-8 * (z @ linear @ z.mT)))
     assert (0.7 < ratio < 1) if finite else ratio == pytest.approx(1, rel=0.01)
-    assert part.growth == pytest.approx(0.2)  # half a frame at 24 per second is one at 48
+    assert float(part.growth) == pytest.approx(0.2)  # half a frame at 24 per second is one at 48
 
 
 @pytest.mark.parametrize("frames", [24, 48])
@@ -249,14 +281,15 @@ def test_a_turned_and_moved_scene_moves_likewise(framed: bool) -> None:
 
 
 def test_everything_of_the_model_learns() -> None:
-    model = neural_model()
+    model = neural_model(template=partial(NEURAL["template"], links=Links(4)))
     batch, state = model.batch((0,)), make_state(model.scenes[0])
     prepared = model.prepare(batch)
     step = model.step(batch, state, prepared=prepared)
     step = model.step(batch, SimState(step.positions, state.positions), prepared=prepared)
     (step.positions.square().sum() + step.momentum).backward()
     still = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()]
-    assert not [n for n in still if "unit_decoder.2.bias" not in n], still  # what is taken off again at rest
+    # What is taken off again at rest, and what decodes springs, of which a solid body has none.
+    assert not [n for n in still if "unit_decoder.2.bias" not in n and "link_decoder" not in n], still
 
 
 @torch.no_grad()
@@ -300,7 +333,7 @@ def test_the_network_reads_only_what_the_modes_carry() -> None:
 
 @torch.no_grad()
 def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement() -> None:
-    """Modes far too fast for the frames, and links that turn far: explicit forces would make them grow."""
+    """Modes far too fast for the frames, and units that turn far: explicit forces would make them grow."""
     model = neural_model(lever=0.0, output_scale=0.0)
     model.template.stiffness.fill_(0.35)  # thirty times as stiff
     batch, scene = model.batch((0,)), model.scenes[0]
@@ -317,25 +350,24 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement() -> N
 
 def test_the_material_of_the_units_is_told_as_it_enters_the_matrices(hierarchy) -> None:
     template, count = _template(hierarchy), hierarchy.levels[1].count
-    units, links = torch.zeros(count, 3, dtype=torch.float64), template.body(0).distance.new_zeros(1, 3)
-    links = links.expand(template.body(0).springs.ends.shape[1], 3)
+    units, none = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
     zeros = torch.zeros(count, 3, dtype=torch.float64)
     fixed = FixedUnits(zeros, zeros[:, 0], zeros[:, 0], zeros[:, 0] + 9, zeros, zeros[:, :1])
 
-    def told(units, links):
-        with mock.patch.object(template, "decode", return_value=(units, links)):
+    def told(units):
+        with mock.patch.object(template, "decode", return_value=(units, none)):
             return {name: found.values for name, found in template.material(0, fixed, 30.0).items()}
 
-    even = told(units, links)
+    even = told(units)
     torch.testing.assert_close(even["stiffness"], torch.ones(count).double())
     torch.testing.assert_close(even["damping"], torch.full((count,), 24 * 0.02).double())  # c_0 is of 24 frames per s
     torch.testing.assert_close(even["density"], torch.full((count,), np.exp(2.5 * np.tanh(9 / 2.5))).double())
     units[4], log3 = torch.tensor([1.0, 1.0, -1.0]), np.log(3)
-    one = told(units, links)
+    one = told(units)
     others = torch.arange(count) != 4
-    assert 1.5 < float(one["stiffness"][4]) < np.e and (one["stiffness"][others] - 1).abs().max() < 1e-12
+    assert float(one["stiffness"][4]) == pytest.approx(np.e) and (one["stiffness"][others] - 1).abs().max() < 1e-12
     assert float(one["damping"][4]) == pytest.approx(24 * 0.02 / np.e)
-    thrice = told(torch.full_like(units, log3), torch.full_like(links, log3))["stiffness"]
+    thrice = told(torch.full_like(units, log3))["stiffness"]
     torch.testing.assert_close(thrice, torch.full((count,), 3.0).double())
 
 

@@ -105,7 +105,7 @@ def test_a_turned_and_moved_scene_gives_turned_and_moved_motion(sees_floor: bool
     state = _thrown(scene)
     alike = SimState(*(x @ turn.mT + shift for x in (state.positions, state.previous)))
     found, expected = _steps(moved, alike, 15), _steps(model, state, 15)
-    for frame, most in ((6, 1e-5), (9, 2e-4)):  # in the air, and after the impact, which magnifies rounding
+    for frame, most in ((6, 1e-4), (9, 2e-4)):  # in the air, and after the impact: motion magnifies rounding
         far = (found[frame].positions - expected[frame].positions @ turn.mT - shift).abs().max()
         assert far < most * scene.diagonal
 

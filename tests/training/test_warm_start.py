@@ -114,7 +114,7 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
 def test_initial_states_are_found_in_the_motion_of_a_frozen_model(toy: Path, law: str) -> None:
     torch.manual_seed(0)
     module, _ = build(compose([f"data.root={toy}", "model=gausim", f"data.law={law}", MODES, *QUICK]))
-    states, true = module.initial_states, 0.7 * torch.randn(2, 6)
+    states, true = module.initial_states, 0.9 * torch.randn(2, 6)
     module.model.freeze(scenes=True)
     tracks = []
     for number, own in enumerate(true):

@@ -1,4 +1,4 @@
-"""The geometry of a scene in modal coordinates: what units and links contribute to elastic energy and mass."""
+"""The geometry of a scene in modal coordinates: what units and springs contribute to elastic energy and mass."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def unit_modes(
 class BodyModes(nn.Module):
     """Constants of one scene's geometry in modal coordinates; without trained parameters.
 
-    All links together are as stiff as the body: in the sum over the modes, or, with finite strain, in their mean. The
-    derivatives among the modes are so stiff that nothing else would count in a sum.
+    The law is either of finite strain (``cells``) or of springs between neighbouring units, all of them together as
+    stiff as the body in the sum over the modes.
     """
 
     modes: Tensor  # Phi (N, 3, M), orthonormal under the units' volumes
@@ -67,11 +67,10 @@ class BodyModes(nn.Module):
     stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M); their sum is that of the homogeneous body
     strain: Tensor  # strain of the modes in the cells near each unit, row by row, times volume (N, 9, M)
     inertia: Tensor  # root of M_i, (N, 3, M)
-    stretch: Tensor  # root of S_ij, (E, M)
-    between: Tensor  # root of T_ij, (E, 3, M)
-    distance: Tensor  # logarithm of the links' lengths over their mean (E,)
-    springs: Springs  # the links as springs, with stiffness per unit of S_ij
-    cells: FiniteStrain | None  # of the homogeneous body, if its strain is finite
+    stretch: Tensor  # root of S_ij, (E, M); (0, M) without springs
+    distance: Tensor  # logarithm of the springs' lengths over their mean (E,)
+    springs: Springs | None  # with stiffness per unit of S_ij
+    cells: FiniteStrain | None  # of the homogeneous body
 
     def __init__(
         self,
@@ -84,15 +83,6 @@ class BodyModes(nn.Module):
             hierarchy, finest, frame, modes=modes, solid=solid, curved=CURVED if finite else 0
         )
         lowest = body.values[0]
-        pairs = _links(rest, pinned, links)
-        change = phi[pairs[1]] - phi[pairs[0]]
-        offset = rest[pairs[1]] - rest[pairs[0]]
-        length = np.linalg.norm(offset, axis=1)
-        stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
-        weight = 1 / values if finite else np.ones_like(values)
-        even = math.sqrt((weight * body.values).sum() / lowest / max(float((weight * stretch**2).sum()), 1e-30))
-        # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
-        self.tie = math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
         arrays = {
             "modes": phi,
             "gradients": slope,
@@ -101,15 +91,27 @@ class BodyModes(nn.Module):
             "stiffness": body.cell_stiffness(rest, pinned) / lowest,
             "strain": body.strains(rest),
             "inertia": phi * np.sqrt(mass)[:, None, None],
-            "stretch": even * stretch,
-            "between": self.tie * change,
-            "distance": np.log(length / length.mean()),
         }
+        springs, arrays["stretch"], arrays["distance"] = None, np.zeros((0, len(values))), np.zeros(0)
+        if not finite:
+            springs, arrays["stretch"], arrays["distance"] = _net(body, rest, pinned, phi, links)
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
-        self.springs = Springs(pairs, rest, phi, (even / length) ** 2)
+        self.springs = springs
         self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
         self.vibrations = body.vibrations
+
+
+def _net(
+    body: SolidBody, rest: np.ndarray, pinned: np.ndarray, phi: np.ndarray, neighbours: int
+) -> tuple[Springs, np.ndarray, np.ndarray]:
+    """Springs between neighbouring units, the roots (E, M) of S_ij, and logarithms of their lengths over the mean."""
+    pairs = _links(rest, pinned, neighbours)
+    offset = rest[pairs[1]] - rest[pairs[0]]
+    length = np.linalg.norm(offset, axis=1)
+    stretch = np.einsum("eam,ea->em", phi[pairs[1]] - phi[pairs[0]], offset) / (length**2)[:, None]
+    even = math.sqrt(body.values.sum() / body.values[0] / max(float((stretch**2).sum()), 1e-30))
+    return Springs(pairs, rest, phi, (even / length) ** 2), even * stretch, np.log(length / length.mean())
 
 
 def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:

@@ -1,34 +1,38 @@
 """The template of the neural simulator: a solid body whose material a shared network decodes from units' attributes.
 
 The geometry is computed once per scene: the lowest modes Phi of the solid body around the kernels
-(:mod:`gausim.models.template.solid`) and the contributions of each unit i and of each link (i, j) of neighbouring units
-to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all scenes map
-each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
+(:mod:`gausim.models.template.solid`) and the contributions of each unit i, and of each spring (i, j) of a net of
+springs, to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all
+scenes map each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
 
     s_i, b_i, d_i = decode(a_i) + (a_i1, a_i1, a_i2)
-    p_ij, q_ij, g_ij = decode(a_i, a_j, distance) + (m, 0, m) with m = (a_i1 + a_j1) / 2
+    g_ij = decode(a_i, a_j, distance) + (a_i1 + a_j1) / 2
 
 The first attribute is thus itself the logarithm of stiffness over that of a reference material, the second that of
 damping. These factors give, in modal coordinates z,
 
-    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
-    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of units, and of matter between them
-    C = 2 (sum_i t_i rho_i M_i + sum_ij (t_i + t_j) / 2 e^{q_ij} T_ij)     drag, with t_i = tanh(c_0 e^{d_i} / 2)
+    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij e^{g_ij} S_ij)   stiffness: of shear, of volume, of springs
+    M = sum_i rho_i M_i                                    inertia
+    C = 2 sum_i t_i rho_i M_i                              drag, with t_i = tanh(c_0 e^{d_i} / 2)
     D = C + (tr C / (4 tr M) + c_1) K                      damping
 
-k, c_0 and c_1 are trained numbers common to all scenes. In a step of the trapezoidal rule an even drag c_0 reduces the
-amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the first part of the factor
-of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and strong drag would turn the
-velocity round instead of stopping it. What is nonlinear are either the cells of the units, with e^{s_i} and e^{b_i}
-(law ``solid``, :mod:`gausim.models.template.finite_strain`), or the links of stiffness e^{g_ij} (law ``springs``,
-:mod:`gausim.models.template.springs`). Both resist the growth of strain, or of length, besides, which no rotation of
-the body meets: without it, vibrations near the frame rate ring on. A frame is the step that all modal templates have in
-common (:class:`gausim.models.template.modal.ModalScene`). Modal derivatives swing up to a thousand times in a frame,
-where a step can neither follow nor damp them and they tremble on. What they do is to follow other modes, and they still
-do with inertia max(0, K_mm / w^2 - M_mm) more, with which none swings faster than w, twice in a frame. K, M and D are
-positive semi-definite for all decoded values, so that a step never creates energy, and without damping it conserves
-energy. It does not amplify vibrations too fast for the frame rate. The decoders' only geometric input are distances, so
-that they generalise to other bodies and orientations.
+A net is no solid, and no field of material in a solid says how it holds together. So of a net of springs K is
+H^T R (1 + 0.3 W) (1 + 0.3 W)^T R^T H and M is H^T M H, with R R^T = K and M as above, H = 1 + 0.3 W', and W and W'
+trained for each scene.
+
+k, c_0, c_1 and the resistance to growth are trained numbers common to all scenes. In a step of the trapezoidal rule an
+even drag c_0 reduces the amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the
+first part of the factor of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and
+strong drag would turn the velocity round instead of stopping it. What is nonlinear are either the cells of the units,
+with e^{s_i} and e^{b_i} (law ``solid``, :mod:`gausim.models.template.finite_strain`; it has no springs), or the springs
+of stiffness e^{g_ij} (law ``springs``, :mod:`gausim.models.template.springs`). Both resist the growth of strain, or of
+length, besides, which no rotation of the body meets: without it, vibrations near the frame rate ring on. A frame is the
+step that all modal templates have in common (:class:`gausim.models.template.modal.ModalScene`). Modal derivatives swing
+up to a thousand times in a frame, where a step can neither follow nor damp them and they tremble on. What they do is to
+follow other modes, and they still do with inertia max(0, K_mm / w^2 - M_mm) more, with which none swings faster than w,
+twice in a frame. K, M and D are positive semi-definite for all decoded values, so that a step never creates energy, and
+without damping it conserves energy. It does not amplify vibrations too fast for the frame rate. The decoders' only
+geometric input are distances, so that they generalise to other bodies and orientations.
 """
 
 from __future__ import annotations
@@ -58,11 +62,12 @@ from gausim.nn.mlp import mlp
 LARGEST_LOG = 2.5
 # Largest angular frequency of a mode of a body with finite strain: two swings a frame [1 / frame].
 FASTEST = 4 * math.pi
-# Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
-# as a body's periods are wrong, strong damping fits best, and training is slow to reduce it again.
-GAIN, DAMPING_GAIN = 10.0, 0.5
-# Initial stiffness of the links e^{g_ij} over that of the body, by law.
-SPRINGS_OF_LAW = {"solid": 0.0, "springs": 1.0}
+# Gains of k, of the dampings and of the resistance to growth over the decoders' weights, for one learning rate. That of
+# damping is smaller: as long as a body's periods are wrong, strong damping fits best, and training is slow to reduce it
+# again.
+GAIN, DAMPING_GAIN, GROWTH_GAIN = 10.0, 0.5, 2.0
+# Gain of W and W', and part of the mean stiffness that is added for its Cholesky factor.
+MIXING_GAIN, LEAST_STIFF = 0.3, 1e-6
 # Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
 
@@ -72,11 +77,10 @@ DEFAULT_SOLID = SolidSettings()
 
 @dataclass(frozen=True)
 class Links:
-    """Links between neighbouring units."""
+    """What neighbouring units do to each other."""
 
-    neighbours: int = 24  # of a unit
-    linear: float = 0.3  # initial stiffness and inertia of all links over the body's
-    damping: float = 0.03  # resistance to the growth of length or strain over that to it [frames at 24 per second]
+    neighbours: int = 24  # of a unit, to which springs lead in the law ``springs``
+    damping: float = 0.03  # initial resistance to growth of length or strain over that to it [frames at 24 per second]
 
 
 @dataclass(frozen=True)
@@ -96,12 +100,11 @@ class Matrices:
     inertia: Float[Tensor, "M M"]  # M, and with finite strain what slows the fastest modes (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     units: Float[Tensor, "N 2"]  # k e^{s_i} and k e^{b_i} of every unit (N, 2)
-    springs: Float[Tensor, " E"]  # k e^{g_ij} of every link, in units of S_ij (E,)
+    springs: Float[Tensor, " E"]  # k e^{g_ij} of every spring, in units of S_ij (E,); none in the law ``solid``
     density: Float[Tensor, " N"]  # of every unit over that at the beginning
-    between: Float[Tensor, " E"]  # mass of every link in units of T_ij
     uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
-    tense: Float[Tensor, " E"]  # the same of every link, in units of S_ij
-    growth: Tensor | float  # resistance to the growth of length or strain over that to it [frames]
+    tense: Float[Tensor, " E"]  # the same of every spring, in units of S_ij
+    growth: Tensor  # resistance to the growth of length or strain over that to it [frames]
     viscosity: Tensor  # the part of K in D [frames]
     rate: Tensor  # the part of inertia beyond the mass in D [1 / frame]
 
@@ -168,8 +171,11 @@ class MaterialTemplate(Template):
         self.viscosity_scale: dict[int, float] = {}  # factors on c_1 of scenes, not saved with the model
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.damping = nn.Parameter(torch.zeros(2))
+        self.growth = nn.Parameter(torch.zeros(()))
+        nets = {str(i): len(self.body(i).values) for i, law in enumerate(self.laws) if law == "springs"}
+        self.nets = nn.ParameterDict({i: torch.zeros(2, count, count) for i, count in nets.items()})
         self.unit_decoder = mlp((attributes, hidden, 3))
-        self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
+        self.link_decoder = mlp((3 * attributes + 1, hidden, 1))
 
     def has_drag(self, scene_id: int) -> bool:
         """Whether a scene has drag, which the second attribute changes."""
@@ -192,78 +198,86 @@ class MaterialTemplate(Template):
 
     def decode(
         self, body: BodyModes, attributes: Float[Tensor, "N A"]
-    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
-        """s, b and d of every unit; p, q and g of every link (see the module's docstring).
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " E"]]:
+        """s, b and d of every unit; g of every spring (see the module's docstring).
 
         The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
         What the decoders give is bounded; the first two attributes are not, so that one material may be many times as
         stiff as another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
-        a, b = (attributes.index_select(0, end) for end in body.springs.ends)
-        links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
         stiffness, damping = attributes[:, 0], attributes[:, 1]
-        own, mean = torch.stack((stiffness, stiffness, damping), -1), (a + b)[:, 0] / 2
-        between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
-        return own + _saturated(units), between + _saturated(links)
+        own = torch.stack((stiffness, stiffness, damping), -1) + _saturated(units)
+        if body.springs is None:
+            return own, attributes.new_zeros(0)
+        a, b = (attributes.index_select(0, end) for end in body.springs.ends)
+        springs = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
+        return own, (a + b)[:, 0] / 2 + _saturated(springs[:, 0])
 
-    def _damping(self, scene_id: int) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """c_0 and c_1 of a scene [1 / frame, frames].
+    def _damping(self, scene_id: int) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""]]:
+        """c_0, c_1 and the resistance to growth of a scene [1 / frame, frames, frames].
 
-        A net of springs has no drag, and c_1 as given: a fit would take its errors of phase for damping, since a motion
-        out of step is nearest when it is small.
+        A net of springs has no drag, and the others as given: a fit would take its errors of phase for damping, since a
+        motion out of step is nearest when it is small.
         """
         if self.laws[scene_id] == "solid":
             drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+            growth = self.links.damping * (GROWTH_GAIN * self.growth).exp()
         else:
             viscosity = cast(Tensor, self.log_damping)[1].exp()
-            drag = torch.zeros_like(viscosity)
-        return drag, viscosity * self.viscosity_scale.get(scene_id, 1.0)
+            drag, growth = torch.zeros_like(viscosity), torch.full_like(viscosity, self.links.damping)
+        return drag, viscosity * self.viscosity_scale.get(scene_id, 1.0), growth
 
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float | Tensor
     ) -> Matrices:
         """K, M and D of one scene from the densities and attributes of its units; ``dt`` is the frame interval [s]."""
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
-        units, links = self.decode(body, attributes)
+        units, springs = (logarithms.exp() for logarithms in self.decode(body, attributes))
         k = (self.log_k + GAIN * self.stiffness).exp() * frame**2
-        drag, viscosity = self._damping(scene_id)
-        strength = SPRINGS_OF_LAW[self.laws[scene_id]]
-        springs = strength * links[:, 2].exp()
-        stretch = (self.links.linear * links[:, 0].exp() + springs)[:, None] * body.stretch
-        cells = units[:, :2].exp()
-        stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness) + body.stretch.mT @ stretch
-        density, between = _saturated(log_density).exp(), self.links.linear * links[:, 1].exp()
-        inertia, dragged = _inertia(body, density, between, (drag * frame * units[:, 2].exp()).div(2).tanh())
-        rate = _trace(dragged) / _trace(inertia)
-        stiffness = k * stiffness
+        drag, viscosity, growth = self._damping(scene_id)
+        cells = units[:, :2]
+        stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness)
+        stiffness = k * (stiffness + body.stretch.mT @ (springs[:, None] * body.stretch))
+        density = _saturated(log_density).exp()
+        mass, dragged = _inertia(body, density, (drag * frame * units[:, 2]).div(2).tanh())
+        if str(scene_id) in self.nets:
+            stiffness, mass = self._of_net(scene_id, stiffness, mass)
+        rate = _trace(dragged) / _trace(mass)
         viscous = rate / 4 + viscosity / frame
-        mass, damping = inertia, dragged + viscous * stiffness
+        inertia, damping = mass, dragged + viscous * stiffness
         if body.cells is not None:
             slowed = (stiffness.diagonal() / FASTEST**2 - mass.diagonal()).clamp_min(0).diag()
             inertia, damping = mass + slowed, damping + rate * slowed
-        tense = k * (self.links.linear * (links[:, 0].exp() - 1) + springs - strength)
         return Matrices(
-            stiffness, mass, inertia, damping, k * cells, k * springs, density, between, k * (cells - 1),
-            tense, self.links.damping / frame, viscous, rate,
+            stiffness, mass, inertia, damping, k * cells, k * springs, density, k * (cells - 1), k * (springs - 1),
+            growth / frame, viscous, rate,
         )  # fmt: skip
+
+    def _of_net(
+        self, scene_id: int, stiffness: Float[Tensor, "M M"], mass: Float[Tensor, "M M"]
+    ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M M"]]:
+        """K and M of a net of springs from those of its cells, springs and units."""
+        one = torch.eye(len(mass), dtype=mass.dtype, device=mass.device)
+        between, moved = one + MIXING_GAIN * self.nets[str(scene_id)]
+        root = torch.linalg.cholesky_ex(stiffness + LEAST_STIFF * _trace(stiffness) / len(one) * one)[0]
+        pull = (root @ between).mT @ moved
+        return pull.mT @ pull, moved.mT @ mass @ moved
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, density and, where there is drag, damping of the units as they enter K, M and D.
 
-        Stiffness is the unit's part of the trace of K (half of each of its links) over the same part of the homogeneous
-        body that k stands for; damping is the drag c_0 e^{d_i}.
+        Stiffness is the unit's part of the trace of K (half of each of its springs) over that of the homogeneous body
+        that k stands for; damping is the drag c_0 e^{d_i}.
         """
         body = self.body(scene_id)
-        decoded, links = self.decode(body, units.attributes)
+        decoded, springs = self.decode(body, units.attributes)
         parts = body.stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)  # of shear and volume (2, N)
-        strength = SPRINGS_OF_LAW[self.laws[scene_id]]
-        factors = self.links.linear * links[:, 0].exp() + strength * links[:, 2].exp()
-        size = 0.5 * body.stretch.square().sum(-1)
         own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
-        for end in body.springs.ends:
-            own = own.index_add(0, end, factors * size)
-            homogeneous = homogeneous.index_add(0, end, (self.links.linear + strength) * size)
+        size = 0.5 * body.stretch.square().sum(-1)
+        for end in () if body.springs is None else body.springs.ends:
+            own = own.index_add(0, end, springs.exp() * size)
+            homogeneous = homogeneous.index_add(0, end, size)
         properties = {
             "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
@@ -284,8 +298,12 @@ class MaterialTemplate(Template):
         return 2 * math.pi / math.sqrt(float(squared)) / REFERENCE_FPS
 
     def shared(self, prefix: str) -> tuple[str, ...]:
-        """Prefixes of the names of the decoders, of k and of the dampings."""
-        return tuple(prefix + name for name in ("stiffness", "damping", "unit_decoder.", "link_decoder."))
+        """Prefixes of the names of the decoders, of k, of the dampings and of the resistance to growth."""
+        return tuple(prefix + name for name in ("stiffness", "damping", "growth", "unit_decoder.", "link_decoder."))
+
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """The name of W and W' of a net of springs; a solid has none."""
+        return (f"{prefix}nets.{scene_id}",)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
@@ -309,16 +327,11 @@ class MaterialTemplate(Template):
 
 
 def _inertia(
-    body: BodyModes, density: Float[Tensor, " N"], between: Float[Tensor, " E"], lost: Float[Tensor, " N"]
+    body: BodyModes, density: Float[Tensor, " N"], lost: Float[Tensor, " N"]
 ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M M"]]:
-    """M and C from the densities of units and links and from t_i, the share of momentum that each unit loses."""
-    heavy, tied = density[:, None, None] * body.inertia, between[:, None, None] * body.between
-    root, links = body.inertia.flatten(0, 1), body.between.flatten(0, 1)
-    inertia = root.mT @ heavy.flatten(0, 1) + links.mT @ tied.flatten(0, 1)
-    first, second = (lost.index_select(0, end) for end in body.springs.ends)
-    loss = (first + second)[:, None, None]  # twice a link's mean
-    dragged = 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
-    return inertia, dragged + links.mT @ (loss * tied).flatten(0, 1)
+    """M and C from the densities of units and from t_i, the share of momentum that each loses."""
+    heavy, root = density[:, None, None] * body.inertia, body.inertia.flatten(0, 1)
+    return root.mT @ heavy.flatten(0, 1), 2 * root.mT @ (lost[:, None, None] * heavy).flatten(0, 1)
 
 
 def _trace(matrix: Float[Tensor, "M M"]) -> Float[Tensor, ""]:
@@ -343,21 +356,22 @@ class PreparedMaterial(ModalScene):
         self.body, self.values, self.reference = body, body.values, reference
         self.mass, self.inertia = matrices.mass, matrices.inertia
         self.stiffness, self.damping = matrices.stiffness, matrices.damping
-        self.nonlinear, self.factor, self.growth = body.springs, matrices.springs, matrices.growth
+        self.growth = matrices.growth
+        if body.springs is not None:
+            self.nonlinear, self.factor = body.springs, matrices.springs
         if body.cells is not None:
             self.nonlinear, self.factor, self.corrections = body.cells, matrices.units, 4
 
     def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
-        """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.
+        """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i.
 
         And that of the strain of the reference, which is static for a homogeneous body: of the stiffness beyond it.
         """
         acceleration, strain = load.split((3, 9), -1)
-        first, second = (acceleration.index_select(1, end) for end in self.body.springs.ends)
-        tied = self.body.tie * self.matrices.between[:, None] * (second - first)
-        own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
-        own = own + tied.flatten(1) @ self.body.between.flatten(0, 1)
-        own = own + self.body.springs.pull(strain, self.matrices.tense)
+        if self.body.springs is None:
+            own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
+        else:
+            own = super().force(load) + self.body.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
     def correction_unit(self) -> Float[Tensor, ""]:

@@ -36,7 +36,6 @@ def reduced_step(part: PreparedMaterial) -> tuple[Arrays, dict[str, float]]:
         cells = part.body.cells
         moduli = cells.volume[:, None] * matrices.units * matrices.units.new_tensor((2 * SECOND, FIRST))
         arrays |= {"cells": cells.gradients.unflatten(0, (-1, 9)), "moduli": moduli}
-    else:
-        springs = part.body.springs
+    elif (springs := part.body.springs) is not None:
         arrays |= {"ends": springs.ends.mT, "offset": springs.offset, "spring": matrices.springs * springs.stiffness}
     return {name: array.cpu().numpy() for name, array in arrays.items()}, numbers
