@@ -55,10 +55,6 @@ def text(path: Path) -> str:
     return "\n".join("".join(cell["source"]) for kind in ("markdown", "code") for cell in cells(path, kind))
 
 
-def test_the_four_are_there() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["01_quickstart", "02_physics", "03_ablation_report", "04_forces"]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_outputs_are_stripped_any_environment_has_the_kernel_and_named_files_exist(path: Path) -> None:
     for cell in cells(path, "code"):

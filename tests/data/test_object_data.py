@@ -1,5 +1,8 @@
+from __future__ import annotations
+
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import mistakes
 from helpers.blob import FRAMES, POINTS, VIEWS, frame_pixels
 from helpers.plain import edit_json
 from helpers.toy_object import surround
@@ -14,6 +18,7 @@ from helpers.toy_object import surround
 from gausim.compose.config import compose
 from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.frames import open_frames
+from gausim.data.idle import idle_sequences
 from gausim.data.images import composite, write_rgba
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
@@ -279,3 +284,34 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path) -> None:
     twice = [{"file_path": f"cam/{n}.png", "time": 0.5} for n in range(2)]
     with pytest.raises(DataError, match="does not grow"):
         open_frames(sequence(tmp_path / "t", twice), ("cam",), 24)
+
+
+def still(root: Path) -> None:
+    for folder in (root / "sequences/seq_001").glob("*/"):
+        mistakes.reorder(folder, lambda number: 0)
+
+
+def black(root: Path) -> None:
+    mistakes.every_image(root, lambda p: np.dstack((0 * p[..., :3], p[..., 3])), "seq_001/*/*")
+
+
+KINDS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "sound": (lambda root: None, ""),
+    "one camera still": (lambda root: mistakes.reorder(root / "sequences/seq_001/cam_0", lambda number: 0), ""),
+    "still": (still, "nothing moves (the frames of every training view are one picture) in seq_001."),
+    "black": (black, "the object is black in seq_001."),
+    "empty": (lambda root: mistakes.every_image(root, np.zeros_like, "seq_001/*/*"),
+              "nothing is visible (alpha is 0 in all training views) in seq_001."),
+    "all empty": (lambda root: mistakes.every_image(root, np.zeros_like), "training views) in seq_000, seq_001."),
+    "opaque": (lambda root: mistakes.every_image(root, lambda p: np.dstack((0 * p[..., :3], 255 + 0 * p[..., 3]))),
+               "black in seq_000, seq_001."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_idle_sequences_are_named(kind: str, toy: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(toy, tmp_path / "data")
+    spoil, expected = KINDS[kind]
+    spoil(root)
+    told = list(idle_sequences([ObjectData(root)]))
+    assert [expected in text for text in told] == [True] * bool(expected)

@@ -64,14 +64,6 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(predicted, graph) 
     assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in model.predicted_levels]
 
 
-def test_absent_scene_gets_no_gradient() -> None:
-    scenes = [make_scene(70), make_scene(55, seed=1)]
-    model = make_model(scenes)
-    model.step(model.batch((1,)), make_state(scenes[1])).positions.square().sum().backward()
-    assert model.log_density[0].grad is None and model.attributes[0].grad is None
-    assert float(model.log_density[1].grad.abs().max()) > 0 and float(model.attributes[1].grad.abs().max()) > 0
-
-
 def _levels(model, amount: float = 0.1):
     """The predicted levels of two sequences and the centres of mass of their units."""
     scene, batch = model.scenes[0], model.batch((0, 0))

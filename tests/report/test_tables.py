@@ -41,7 +41,6 @@ make_results = importlib.util.module_from_spec(MAKE)
 MAKE.loader.exec_module(make_results)
 page = make_results.page
 HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
-BOUNCE = {"height": 0.5, "rise": 0.2, "height_error": 0.1, "rise_error": 0.25, "depth": 0.3}
 
 
 # ------------------------------------------------------------------------------------------------------------- pivot
@@ -169,20 +168,6 @@ def test_the_papers_own_figures() -> None:
 
 
 # -------------------------------------------------------------------------------- bodies that fall or are in hands
-
-
-def test_bounces_of_methods_references_and_the_truth(tmp_path: Path) -> None:
-    for seed, error in ((0, 1.0), (1, 2.0)):
-        made = make_curves(error)
-        made.values["ballistic"], made.info.reference = made.values.pop("static"), "ballistic"
-        made.bounces.update(
-            gausim={**BOUNCE, "height": 0.4 + 0.1 * seed}, ballistic={**BOUNCE, "rise": None},
-            truth={**BOUNCE, "height_error": 0.0, "rise_error": 0.0},
-        )  # fmt: skip
-        evaluate(write_run(tmp_path / f"seed_{seed}", config(seed=seed)), made)
-    rows = shown(grids_of(tmp_path)["toy_bunny, bounce"])
-    assert rows["gausim"] == ["0.450 ± 0.071", "10.0 ± 0.0", "0.200 ± 0.000", "25.0 ± 0.0", "0.30 ± 0.00"]
-    assert rows["ballistic"][2] == "" and rows["truth"][1] == "0"
 
 
 # --------------------------------------------------------------------------------------------------------------- files
