@@ -209,15 +209,6 @@ def test_other_names_are_taken(name: str) -> None:
     assert safe_name(name, "here") == name
 
 
-@pytest.mark.parametrize("levels", [6, 9, 60])
-def test_nested_aliases_are_bounded(tmp_path: Path, levels: int) -> None:
-    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, levels)]
-    (tmp_path / "a.yaml").write_text("\n".join(lines))
-    with pytest.raises(ValueError, match="when its aliases are written out"):
-        read_yaml(tmp_path / "a.yaml")
-
-
 def test_a_yaml_that_contains_itself_or_is_huge_is_refused_and_common_aliases_are_not(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("a: &a\n  b: *a\n")
     with pytest.raises(ValueError, match="aliases"):
@@ -233,7 +224,7 @@ def test_a_yaml_that_contains_itself_or_is_huge_is_refused_and_common_aliases_ar
 @pytest.mark.parametrize("place", ["config.yaml", "experiment/evil.yaml", "data/test/evil.yaml"])
 def test_aliases_of_a_run_of_others_are_bounded(tmp_path: Path, place: str, capsys) -> None:
     lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 9)]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 60 if place == "config.yaml" else 9)]
     (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / place).write_text("\n".join(lines))
     assert main(["train", "--config-dir", str(tmp_path), "--config-name", "config"]) == 2

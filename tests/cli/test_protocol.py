@@ -155,12 +155,10 @@ def test_looks_are_declared_counted_and_said(run, capsys, monkeypatch) -> None:
 def test_a_damaged_record_of_looks_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "test.json"
     assert read_looks(path) == []
-    path.write_text('{"schema": "gausim.test/2", "looks": []}')
-    with pytest.raises(RunError, match=r"test\.json: expected the record"):
-        read_looks(path)
-    path.write_text("{}")
-    with pytest.raises(RunError, match=r"test\.json: expected the record"):
-        read_looks(path)
+    for text in ('{"schema": "gausim.test/2", "looks": []}', "{}"):
+        path.write_text(text)
+        with pytest.raises(RunError, match=r"test\.json: expected the record"):
+            read_looks(path)
 
 
 def test_data_without_a_test_part_know_no_look(toy: Path, run: Path) -> None:

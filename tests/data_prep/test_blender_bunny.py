@@ -30,14 +30,16 @@ PLAN = Plan(
     name="box", up="z", sequences=3, frames=4, views=3, heldout=1, points=40,
     pictures=Pictures(stills=23, resolution=(20, 12), still_resolution=(16, 16), samples=1),
 )  # fmt: skip
-BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 2) for z in (0, 3))
-BOX += "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 
 
 @pytest.fixture
 def mesh(tmp_path: Path) -> Path:
     path = tmp_path / "box.obj"
-    path.write_text(BOX)
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    lines += ["f " + " ".join(f"{i + 1}/1/{i + 1}" for i in quad) for quad in QUADS]
+    path.write_text("# a box\nvt 0 0\n" + "\n".join(lines) + "\n")
     return path
 
 
@@ -198,25 +200,14 @@ def test_a_process_is_stopped_when_another_failed(tmp_path: Path) -> None:
         os.kill(int(heard[0]), 0)
 
 
-CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
-QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 POINTS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.3, 1)], np.float64)
 
 
-def box_obj(path: Path) -> Path:
-    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
-    lines += ["f " + " ".join(f"{i + 1}/1/{i + 1}" for i in quad) for quad in QUADS]
-    path.write_text("# a box\nvt 0 0\n" + "\n".join(lines) + "\n")
-    return path
-
-
-def ply(
-    path: Path, encoding: str, faces: list[tuple[int, ...]], *, count: str | None = None, kind: str = "int"
-) -> Path:
-    header = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {count or len(CORNERS)}\n"
+def ply(path: Path, encoding: str, faces: list[tuple[int, ...]]) -> Path:
+    header = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {len(CORNERS)}\n"
     header += "property float x\nproperty float y\nproperty double z\nproperty uchar red\n"
-    header += f"element face {len(faces)}\nproperty uchar quality\nproperty list uchar {kind} vertex_indices\n"
+    header += f"element face {len(faces)}\nproperty uchar quality\nproperty list uchar int vertex_indices\n"
     header += "end_header\n"
     if encoding == "ascii":
         lines = [f"{x} {y} {z} 255" for x, y, z in CORNERS]
@@ -235,8 +226,8 @@ def volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def test_obj_and_all_encodings_of_ply_give_the_same_box(tmp_path: Path) -> None:
-    expected = read_mesh(box_obj(tmp_path / "box.obj"))
+def test_obj_and_all_encodings_of_ply_give_the_same_box(mesh: Path, tmp_path: Path) -> None:
+    expected = read_mesh(mesh)
     assert expected.vertices.tolist() == [list(c) for c in CORNERS] and expected.triangles.shape == (12, 3)
     for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
         found = read_mesh(ply(tmp_path / f"{encoding}.ply", encoding, QUADS))
@@ -278,15 +269,14 @@ def test_damaged_ply_and_useless_surfaces_are_refused(tmp_path: Path, monkeypatc
         refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
 
 
-def test_surface_stands_upright_in_its_frame(tmp_path: Path) -> None:
-    path = box_obj(tmp_path / "box.obj")
+def test_surface_stands_upright_in_its_frame(mesh: Path) -> None:
     for up, extent in (("x", (4 / 3, 2, 2 / 3)), ("y", (2, 2 / 3, 4 / 3)), ("z", (2 / 3, 4 / 3, 2))):
-        found = make_surface(read_mesh(path), path, up=up, points=50, seed=0)
+        found = make_surface(read_mesh(mesh), mesh, up=up, points=50, seed=0)
         np.testing.assert_allclose(np.ptp(found.vertices, axis=0), extent, rtol=1e-6)
         np.testing.assert_allclose(found.vertices[:, :2].min(0), -found.vertices[:, :2].max(0), rtol=1e-6)
         assert found.vertices[:, 2].min() == 0 and len(found.gt_ids) == 50
         # Outward faces stay outward: the object is turned, not mirrored.
-        original = read_mesh(path)
+        original = read_mesh(mesh)
         turned = volume(found.vertices.astype(np.float64), found.faces)
         assert np.sign(turned) == np.sign(volume(original.vertices, original.triangles))
 

@@ -43,9 +43,6 @@ page = make_results.page
 HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
 
 
-# ------------------------------------------------------------------------------------------------------------- pivot
-
-
 def table_of(*entries: Entry, **metrics: Metric) -> Results:
     return Results(SCHEMA, "Title", made=Made("2026-01-01", ["abc"], ["gausim train"]), objects={"o": ObjectInfo()},
                    metrics=metrics, table=list(entries), facts={"minutes": 0.5, "of": "6"})  # fmt: skip
@@ -106,9 +103,6 @@ def test_pages_name_records(tmp_path: Path) -> None:
         page(tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------------------- of a sweep
-
-
 def test_the_papers_table(sweep: Path) -> None:
     grid = grids_of(sweep)["l2 [1e-3] ↓, training views"]
     assert [(c.group, c.label) for c in grid.columns] == [("toy_bunny", s) for s in ("Seen", "Unseen 34", "Unseen 44")]
@@ -165,12 +159,6 @@ def test_the_papers_own_figures() -> None:
     for metric, expected in sums.items():
         pairs = [pair for by_object in TABLES[metric].values() for both in by_object.values() for pair in both]
         assert len(pairs) == 30 and [sum(p[i] for p in pairs) for i in (0, 1)] == pytest.approx(expected)
-
-
-# -------------------------------------------------------------------------------- bodies that fall or are in hands
-
-
-# --------------------------------------------------------------------------------------------------------------- files
 
 
 def test_the_page_stands_alone_and_lists_its_runs(sweep: Path) -> None:
@@ -251,9 +239,6 @@ def test_latex_nests_is_escaped_and_fills_its_columns(sweep: Path) -> None:
     labels = re.findall(r"\\label\{(.*?)\}", latex)
     assert len(set(labels)) == len(labels) and all(re.fullmatch(r"tab:[A-Za-z0-9-]+", label) for label in labels)
     assert r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
-
-
-# ---------------------------------------------------------------------------------------- the repository's own figures
 
 
 def test_figures_of_readme_and_results_are_of_the_records() -> None:
