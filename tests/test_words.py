@@ -6,7 +6,6 @@ import importlib
 import io
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -77,8 +76,7 @@ def test_pages(page: Path) -> None:
     assert len(text.split()) <= LONGEST_PAGE or page.parent.name in ("reference", "results") or page.stem == "results"
 
 
-@cache
-def _help() -> dict[str, str]:
+def test_help_texts() -> None:
     texts = {"gausim": usage()}
     mains = [(f"gausim {name}", command_of(name)) for name in COMMANDS]
     mains += [(f"gausim prepare {name}", importlib.import_module(f"data_prep.{name}").main) for name in STAGES]
@@ -87,11 +85,6 @@ def _help() -> dict[str, str]:
         with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
             main(["--help"])
         texts[name] = said.getvalue()
-    return texts
-
-
-def test_help_texts() -> None:
-    texts = _help()
     assert len(texts) > 20 and all(len(text) > 100 for text in texts.values())
     assert not {name: found for name, text in texts.items() if (found := faults(text))}
 
@@ -125,15 +118,3 @@ def test_messages() -> None:
 def test_the_checks_find_what_they_look_for() -> None:
     assert faults("an error of .36 of static") and faults("It foresees the frames.") and not faults("an error of 0.36")
     assert mean_length("One two three four. Five six seven eight nine ten.") == 5
-
-
-def test_options_begin_with_a_verb() -> None:
-    """No option of the commands begins as a description does: with a preposition, an article or a plural noun."""
-    described = r"(?:of|a|an|the|its|with|for|behind|instead|also|number|default|folder|frames|fraction|size)\b"
-    wrong = {}
-    for name, text in _help().items():
-        options = text.partition("options:")[2]
-        found = re.findall(rf"(?m)^  (--[\w-]+(?: \S+)*?)(?:  +|\n {{8,}}){described}", options)
-        if found:
-            wrong[name] = found
-    assert not wrong

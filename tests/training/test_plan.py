@@ -40,8 +40,6 @@ def cosine(part: float) -> float:
 def test_t_and_rates_of_every_recipe(overrides, data, epochs, steps, factors) -> None:
     plan: TrainingPlan = instantiate(compose(overrides).plan).resolved(data)
     found = course(plan)
-    for epoch, (t, rates) in enumerate(found):
-        print(epoch, t, rates)
     assert len(found) == plan.epochs == epochs and plan.resolved(data) == plan
     assert {epoch: found[epoch][0] for epoch in steps} == steps
     warm = data.can_warm_start and "warm_start=null" not in str(overrides) and overrides != ["model=gausim_paper"]
@@ -90,7 +88,8 @@ def test_schedules() -> None:
     assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
 
 
-@pytest.mark.parametrize("start", [["plan.warm_start.updates=5"], ["plan.warm_start=null"]])
+@pytest.mark.parametrize("start", [["plan.warm_start=null"],
+                                   pytest.param(["plan.warm_start.updates=5"], marks=pytest.mark.slow)])  # fmt: skip
 def test_a_saved_configuration_states_what_ran(start, toy, tmp_path, monkeypatch) -> None:
     ran: list[tuple[int, float, dict[str, float]]] = []
     step = GausSimModule.training_step

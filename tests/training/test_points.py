@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import sway, toy_object
-from helpers.sway import blobs, sample
 from torch import Tensor
 
 from benchmarks.harness import peak_saved_bytes
@@ -23,12 +22,11 @@ from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.rollout import States, windows
 from gausim.training.supervision import comparison
-from gausim.training.supervision import comparison as chunked
 from gausim.training.supervision.comparison import Comparison, ViewGroup
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.points import PointSupervision, attach_points
 
-sample = sway.sample
+sample, blobs = sway.sample, sway.blobs
 SCENE = toy_object.toy_scene()
 
 
@@ -226,7 +224,7 @@ class Case:
 
 @pytest.mark.parametrize("pixels", [1, 3 * STATE, 9 * STATE, 10**9])
 def test_chunks_give_what_one_graph_gives(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunked, "CPU_PIXELS", pixels)
+    monkeypatch.setattr(comparison, "CPU_PIXELS", pixels)
     case = Case(steps=4)
     losses, motion = case.comparison()(case.states, 0)
     expected, moved = case.plain()
@@ -250,7 +248,7 @@ def test_stretches_of_pictures_continue_too() -> None:
 
 
 def test_no_image_is_held_for_the_backward_pass(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunked, "CPU_PIXELS", STATE)
+    monkeypatch.setattr(comparison, "CPU_PIXELS", STATE)
     held = {}
     for steps in (3, 12):
         case = Case(steps)
