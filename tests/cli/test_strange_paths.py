@@ -19,7 +19,7 @@ SUBJECTS = ("missing", "empty", "file", "binary", "locked")
 CALLS = {
     "inspect": ["{}"], "reconstruct": ["{}", "--out", "out.ply"], "verify": ["{}"], "doctor": ["{}"],
     "train": ["data={}"], "adapt": ["{}"], "evaluate": ["{}"], "simulate": ["{}"], "view": ["{}"],
-    "export": ["{}", "--format", "motion"], "report": ["{}"],
+    "export": ["{}", "--format", "html"], "report": ["{}"],
     "prepare ingest": ["{}", "--out", "out"], "prepare poses": ["--images", "{}", "--out", "out"],
     "prepare segment": ["{}", "--backend", "alpha", "--out", "out"],
     "prepare select": ["{}", "--pinned", "below z=0.1", "--out", "out"],
@@ -35,7 +35,7 @@ WRITERS = {
     "inspect": ["{scene}", "--out", "{out}/a.png"], "inspect --clean": ["{scene}", "--clean", "{out}/a.ply"],
     "doctor": ["{object}", "--out", "{out}/d"],
     "evaluate": ["{run}", "--out", "{out}/e"], "simulate": ["{run}", "--frames", "2", "--out", "{out}/s"],
-    "export": ["{run}", "--format", "motion", "--frames", "2", "--out", "{out}/m"],
+    "export": ["{run}", "--format", "html", "--frames", "2", "--out", "{out}/m.html"],
     "report": ["{run}", "--out", "{out}/r"], "prepare pack": ["{object}", "--out", "{out}/p"],
     "prepare select": ["{scene}", "--pinned", "below z=0.1", "--out", "{out}/q"],
     "prepare segment": ["{stills}", "--backend", "alpha", "--out", "{out}/g"],
