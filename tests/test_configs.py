@@ -225,19 +225,6 @@ def test_jobs_of_a_sweep_never_share_a_directory(swept, tmp_path, monkeypatch) -
         assert not re.search(r"(name|seed|ablation|model|output_root)=", str(inside))  # said by the path already
 
 
-def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    seen: list[tuple[str, str]] = []
-    swept = ["-m", "ablation=none,[no_mass,no_momentum]", "model=gausim"]
-
-    def job(config: DictConfig) -> JobResult:
-        seen.append((config.ablation.name, run_dir().parts[-3]))
-        return JobResult(TRAINED, str(run_dir()))
-
-    run_hydra(job, swept)
-    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum")]
-
-
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
     assert folder_name("") == "" and folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
     names = [folder_name(text) for text in ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]]

@@ -66,9 +66,6 @@ def test_only_the_foreground_is_stored_in_a_box_with_its_margin(toy: Path, packe
     assert bounding_box(alpha, 1) == (slice(0, 5), slice(3, 7))
 
 
-# ---------------------------------------------------------------------------------------------------- faults
-
-
 @pytest.fixture
 def store(toy: Path, tmp_path: Path) -> Path:
     pack(toy, tmp_path / "store")
@@ -83,17 +80,14 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "pixels cut": (lambda s: _cut(s / "sequences/seq_001/view_1.npy"), "seq_001", "view_1.npy: cannot be read"),
     "nan": (_header(lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
     "corner": (_header(lambda d: d["views"][0].update(left=30)), "seq_000", "expected 9 frames inside"),
-    "frames": (
-        lambda s: np.save(s / "sequences/seq_000/view_2.npy", np.zeros((8, 1, 1, 4), np.uint8)),
-        "seq_000",
-        "got 8",
-    ),
+    "frames": (lambda s: np.save(s / "sequences/seq_000/view_2.npy", np.zeros((8, 1, 1, 4), np.uint8)), "seq_000",
+               "got 8"),
     "fps": (_header(lambda d: d.update(fps=25)), "seq_000", "fps"),
     "view": (_header(lambda d: d["views"][0].update(name="cam_9")), "seq_000", "cam_9"),
     "facts": (lambda s: edit_json(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),
     "stranger": (lambda s: (s / "notes.txt").write_text("x"), "notes.txt", "not in stage.json"),
     "no sequences": (lambda s: shutil.rmtree(s / "sequences"), "sequences", "holds no sequence"),
-}
+}  # fmt: skip
 
 
 def _cut(path: Path) -> None:

@@ -231,19 +231,12 @@ def test_it_says_that_forces_act_in_part() -> None:
 class Broken:
     """Breaks in the second step, in one of several ways."""
 
-    takes_forces, fps, limited = True, 24.0, 0
-
     def __init__(self, live: Interaction, how: str) -> None:
         self._inner, self._how, self._steps = live._stepper, how, 0
         self.unit_of_kernel = live.unit_of_kernel
 
-    @property
-    def state(self) -> SimState:
-        return self._inner.state
-
-    @property
-    def frame(self):
-        return self._inner.frame
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._inner, name)
 
     def step(self, force=None, *, held=None):
         frame, self._steps = self._inner.step(force, held=held), self._steps + 1
@@ -258,8 +251,6 @@ class Broken:
             third = 0.0 if self._how == "flat" else math.inf
             deformation_gradients[self.unit_of_kernel[33]] *= torch.tensor([1.0, 1.0, third])
         return replace(frame, positions=positions, deformation_gradients=deformation_gradients)
-
-    def settle(self) -> None: ...
 
 
 @pytest.mark.parametrize(("how", "message"), [

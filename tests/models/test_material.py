@@ -198,14 +198,6 @@ def test_an_even_drag_damps_all_modes_alike_however_fast_and_strong_it_is(hierar
         torch.testing.assert_close(product, expected, atol=1e-6, rtol=0)
 
 
-def test_a_load_acts_on_the_learned_masses() -> None:
-    """Of an acceleration within the modes, Phi a, the force is M a."""
-    part, a = neural_model().modal_scene(0), torch.randn(3, 9, generator=torch.Generator().manual_seed(4)).double()
-    accelerations = (a @ part.positions.mT).view(3, -1, 3)
-    load = torch.cat((accelerations, accelerations.new_zeros(*accelerations.shape[:2], 9)), -1)
-    torch.testing.assert_close(part.force(load), a @ part.mass.mT, atol=1e-5, rtol=1e-5)
-
-
 def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous_one(hierarchy) -> None:
     """An even strain S of an evenly stiffer body: minus the integral of the stress of S against the modes' strain."""
     template, body, count = _template(hierarchy), _solid(hierarchy), hierarchy.levels[1].count
