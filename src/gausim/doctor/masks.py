@@ -16,8 +16,8 @@ _AROUND, _EVERYWHERE = 0.8, 0.999
 _UNIFORM, _COLOURED = 8.0, 40.0
 # Haze: largest invisible alpha (of 255), distance from the object [reduced pixels], and fraction of the pixels.
 _FAINT, _AWAY, _HAZE = 26, 6, 0.02
-# Relative jump of a mask's area against the neighbouring frames, and the radius of these.
-_JUMP, _RADIUS = 0.15, 2
+# Relative jump of a mask's area against the neighbouring frames, the radius of these, and the jump over a median step.
+_JUMP, _RADIUS, _STEPS = 0.15, 2, 3
 # Fraction of empty frames that makes a fault.
 _MANY = 0.1
 
@@ -131,7 +131,8 @@ def _blinking(evidence: Evidence) -> Iterator[Finding]:
             around = np.median(near, -1)
             # A body that turns changes its area smoothly: the cubic through its neighbours predicts a frame.
             smooth = (4 * (near[:, 1] + near[:, 3]) - near[:, 0] - near[:, 4]) / 6
-            off = np.minimum(np.abs(area - around), np.abs(area - smooth)) > _JUMP * np.maximum(around, 1)
+            usual = _STEPS * np.median(np.abs(np.diff(area)))  # thin bodies turn edge-on within frames
+            off = np.minimum(np.abs(area - around), np.abs(area - smooth)) > np.maximum(_JUMP * around, max(usual, 1))
             jumps += [f"{item.name} frame {f}" for f in np.nonzero(off)[0] if area[f] > 0]
         if jumps:
             yield Finding(
