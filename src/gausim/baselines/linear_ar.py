@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -71,12 +72,7 @@ def fit_linear_ar(
     Raises:
         DataError: there is no sequence, or one has not more than ``order`` frames.
     """
-    if not displacements or any(len(d) <= order for d in displacements):
-        raise DataError(
-            f"linear AR({order}): expected at least one sequence, with at least {order + 1} seen frames in each."
-        )
-    modes, coordinates = _coordinates(displacements, n_modes)
-    return LinearAR(modes.reshape(-1, *displacements[0].shape[1:]), _fitted(coordinates, order, ridge))
+    return _fit(_coordinates(displacements, order), n_modes, order, ridge)
 
 
 def choose_linear_ar(displacements: Sequence[Float[Tensor, "F P 3"]], sizes: Sequence[int], order: int) -> LinearAR:
@@ -87,23 +83,33 @@ def choose_linear_ar(displacements: Sequence[Float[Tensor, "F P 3"]], sizes: Seq
     Raises:
         DataError: as :func:`fit_linear_ar`.
     """
-    found: list[tuple[bool, float, LinearAR]] = []
-    for n_modes, ridge in itertools.product(sizes, RIDGES):
-        error = 0.0
-        for number, own in enumerate(displacements):
-            part = own[: max(order + 1, 2 * len(own) // 3)]
-            others = [*displacements[:number], *displacements[number + 1 :]] or [part]
-            made = fit_linear_ar(others, n_modes, order, ridge=ridge).rollout(own[:order], len(own) - 1)
-            error += float((made - own).square().mean())
-        whole = fit_linear_ar(displacements, n_modes, order, ridge=ridge)
-        found.append((whole.growth > MOST_GROWTH, error, whole))
-    return min(found, key=lambda own: own[:2])[2]
+    settings = list(itertools.product(sizes, RIDGES))
+    errors = np.zeros(len(settings))
+    for number, own in enumerate(displacements):
+        part = own[: max(order + 1, 2 * len(own) // 3)]
+        known = _coordinates([*displacements[:number], *displacements[number + 1 :]] or [part], order)
+        for i, (n_modes, ridge) in enumerate(settings):
+            made = _fit(known, n_modes, order, ridge).rollout(own[:order], len(own) - 1)
+            errors[i] += float((made - own).square().mean())
+    known = _coordinates(displacements, order)
+    fits = [_fit(known, n_modes, order, ridge) for n_modes, ridge in settings]
+    return min(zip(fits, errors, strict=True), key=lambda own: (own[0].growth > MOST_GROWTH, own[1]))[0]
 
 
-def _coordinates(displacements: Sequence[Tensor], n_modes: int) -> tuple[Tensor, list[Tensor]]:
+def _coordinates(displacements: Sequence[Tensor], order: int) -> tuple[Tensor, list[Tensor]]:
+    """All modes (M, P, 3), the largest first, and coordinates (F, M) of every sequence."""
+    if not displacements or any(len(d) <= order for d in displacements):
+        raise DataError(
+            f"linear AR({order}): expected at least one sequence, with at least {order + 1} seen frames in each."
+        )
     rows = [d.double().flatten(1) for d in displacements]
     _, _, modes = torch.linalg.svd(torch.cat(rows), full_matrices=False)
-    return modes[:n_modes], [row @ modes[:n_modes].T for row in rows]
+    return modes.reshape(-1, *displacements[0].shape[1:]), [row @ modes.T for row in rows]
+
+
+def _fit(known: tuple[Tensor, list[Tensor]], n_modes: int, order: int, ridge: float) -> LinearAR:
+    modes, coordinates = known
+    return LinearAR(modes[:n_modes], _fitted([q[:, :n_modes] for q in coordinates], order, ridge))
 
 
 def _fitted(coordinates: Sequence[Tensor], order: int, ridge: float) -> Float[Tensor, "p M M"]:
