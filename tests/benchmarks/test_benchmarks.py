@@ -1,6 +1,5 @@
 """Every case of the benchmarks at tiny sizes: figures exist, are finite, and ratios fit the times."""
 
-import json
 import math
 import subprocess
 from functools import partial
@@ -93,10 +92,10 @@ def test_teaching_is_measured_in_pairs() -> None:
     assert next(iter(rows.values())).case.startswith("teach, 120 kernels, ")
 
 
-def test_endurance_of_a_run(played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(endurance, "load_run", lambda path, **_: played)
+def test_endurance_of_a_run(played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endurance, "PUSHED_FRAMES", 20)
     played.module.method = SimpleNamespace(hands=lambda sequence: None)
-    assert endurance.main([str(played.run_dir), "300"]) == 0
-    found = json.loads((played.run_dir / "evaluation" / "endurance.json").read_text())["toy"]
-    assert len(found["free"]["energy"]) == 15 and found["free"]["energy"][-1] < found["free"]["energy"][0]
-    assert max(found["pushed"]["away"][:12]) > 0 and "toy, pushed: highest energy" in capsys.readouterr().out
+    (item,) = endurance.run_objects(played)
+    found = endurance.endurance(item, 60)
+    assert len(found["free"]["energy"]) == 3 and found["free"]["energy"][-1] < found["free"]["energy"][0]
+    assert found["pushed"]["away"][0] > 0 and found["pushed"]["peak"] < 60
