@@ -1,6 +1,6 @@
 """Bring public data sets of elastic objects to our layout, checked as `gausim verify` does.
 
-Gravity, floor and hands come along where a set has them; stills are frame 0 of the cameras where it has none. Objects
+Gravity and floor come along where a set has them; stills are frame 0 of the cameras where it has none. Objects
 without masks are to be segmented next. What deviates from a set's layout is refused with file and field.
 """
 
@@ -25,7 +25,6 @@ KINDS = {
     "ready": "READY in the layout of its authors (the paper's captured data)",
     "springgaus": "Spring-Gaus: synthetic falls, films of real falls",
     "pacnerf": "PAC-NeRF: falls before an empty plate",
-    "phystwin": "PhysTwin: real objects that hands move",
     "physdreamer": "PhysDreamer: stills, Gaussians, and films from one place",
 }
 PACKAGES = ("av", "numpy", "opencv-python-headless", "pycolmap", "scipy")
@@ -78,7 +77,7 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about an object that was imported, for people."""
     facts = results["facts"]
     lines = [f"object      {facts['name']}", *described(facts, results["stills"], results["sequences"])]
-    lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free", "grip") if key in facts]
+    lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free") if key in facts]
     lines += [f"{key:<11} {value}" for key, value in results["notes"].items()]
     if results["without_alpha"]:
         return "\n".join([*lines, f"no alpha    in {', '.join(results['without_alpha'])}: segment {out} next"])

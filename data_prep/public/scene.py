@@ -68,8 +68,6 @@ class Motion:
     source: Path  # the file, or the folder, that lists its frames
     views: tuple[View, ...]  # its cameras
     pictures: Mapping[str, tuple[Picture, ...]]  # by camera, F each
-    hands: tuple[np.ndarray, np.ndarray] | None = None  # path (F, C, 3) of points that hold it, (C,) int64 their hands
-    tracks: np.ndarray | None = None  # (F, P, 3) true positions of the object's rest points [scene units]
 
     @property
     def count(self) -> int:

@@ -33,7 +33,6 @@ class ObjectWriter:
         for motion in found.motions:
             self._motion(motion)
         stills = self._stills()
-        self._truth()
         if found.cloud is not None:
             points, colors = found.cloud
             write_npz(self._work / "points.npz", points=points.astype(np.float32), colors=colors)
@@ -58,8 +57,6 @@ class ObjectWriter:
                 posed.append(small)
                 self._tick(motion.name, len(posed), len(motion.views) * motion.count)
         _write_poses(folder / "transforms.json", posed, entries, self._found.fps)
-        if motion.hands is not None:
-            write_npz(folder / "hands.npz", points=motion.hands[0].astype(np.float32), hand=motion.hands[1])
 
     def _stills(self) -> int:
         """Posed stills, or frame 0 of the first sequence in the cameras that are trained on."""
@@ -93,17 +90,6 @@ class ObjectWriter:
         header = read_header(target)
         if header is None or header.mode != "RGBA":
             self._bare.add(what)
-
-    def _truth(self) -> None:
-        """True motion, where all sequences have it: rest points as in frame 0 of the first sequence."""
-        tracks = [motion.tracks for motion in self._found.motions if motion.tracks is not None]
-        if not tracks or len(tracks) < len(self._found.motions):
-            return
-        rest = tracks[0][0]
-        write_npz(self._work / "rest_points.npz", points=rest.astype(np.float32))
-        for motion, positions in zip(self._found.motions, tracks, strict=True):
-            path = self._work / "sequences" / motion.name / "ground_truth.npz"
-            write_npz(path, displacement=(positions - rest).astype(np.float32))
 
 
 def _write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]], fps: float | None) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,37 +93,6 @@ def write_pacnerf(root: Path, *, rgba: bool = False) -> Sample:
     return sample
 
 
-def write_phystwin(root: Path) -> Sample:
-    """A case, `different_types/<case>/`: two hands, whose points alternate, and pixels of a human at the left."""
-    sample = falling(root, (0, 0, -1), 0.02, 0.3)
-    number, human = ("1", "2", "1"), root.parent.parent / "different_types_human_mask" / root.name / "mask"
-    hidden = np.where(np.arange(SIZE) < 6, 255, 0).astype(np.uint8)[None].repeat(SIZE, 0)
-    offsets = 0.012 * np.random.default_rng(0).standard_normal((6, 3))
-    points = np.stack((sample.path[:, :1] + offsets, sample.path[:, -1:] + offsets), 2).reshape(FRAMES, 12, 3)
-    for v in range(3):
-        dump(root / "mask" / f"mask_info_{v}.json",
-             {number[v]: "sloth", "0": "hand", ("2" if number[v] == "1" else "1"): "hand"})  # fmt: skip
-        for f in range(FRAMES):
-            image = sample.image(f, v)
-            save(root / "color" / str(v) / f"{f}.png", before(image, 70))
-            cut = np.where(image[..., 3] > 127, 255, 0).astype(np.uint8)
-            save(root / "mask" / str(v) / number[v] / f"{f}.png", cut)
-            save(human / str(v) / "0" / f"{f}.png", hidden)
-    dump(root / "metadata.json", {"intrinsics": [K.tolist()] * 3, "fps": 30, "WH": [SIZE, SIZE], "frame_num": FRAMES})
-    dump(root / "split.json", {"frame_len": FRAMES, "train": [0, SEEN], "test": [SEEN, FRAMES]})
-    tracks = sample.path[:, ::2].copy()
-    tracks[5:7, 1] = np.nan
-    final = {"object_points": sample.path, "object_colors": np.repeat(COLORS[None] / 255.0, FRAMES, 0),
-             "object_visibilities": np.ones(sample.path.shape[:2], bool), "controller_points": points}  # fmt: skip
-    for name, data in (
-        ("calibrate", [*np.linalg.inv(sample.viewmats)]),
-        ("final_data", final),
-        ("gt_track_3d", tracks),
-    ):
-        (root / f"{name}.pkl").write_bytes(pickle.dumps(data))
-    return sample
-
-
 def write_gaussians(root: Path) -> toy_object.ToyObject:
     """A toy object with the point clouds of READY and PhysDreamer."""
     toy = toy_object.ToyObject(root, toy_object.toy_scene(), frames=FRAMES)
@@ -209,6 +177,5 @@ def dump(path: Path, data: Any) -> None:
 
 WRITERS = {
     "springgaus": (write_springgaus, "render/torus"), "pacnerf": (write_pacnerf, "data/bird"),
-    "phystwin": (write_phystwin, "different_types/double_stretch_sloth"),
     "physdreamer": (write_physdreamer, "physics_dreamer/hat"), "ready": (write_ready, "ready/duck"),
 }  # fmt: skip
