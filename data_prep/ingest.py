@@ -15,10 +15,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from data_prep.capture.films.film import Film, pictures, probe, upright
-from data_prep.capture.films.sheet import write_sheet
 from data_prep.capture.films.sync import METHODS, Alignment, align, facts, measure
 from data_prep.capture.films.takes import Take, find_takes, offset_seconds
 from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
@@ -32,7 +32,7 @@ from gausim.io.files import write_json
 REVISION = 1
 # PNG's effort: 1 is three times as fast as the default and 10 % larger.
 COMPRESSION = 1
-THUMBNAIL = 160
+THUMBNAIL, MOMENTS = 160, 9
 
 LAYOUT = """FILMS is a folder with one folder per sequence, each with one film per camera, named alike in all sequences;
 or a folder with the films of a single sequence. Cameras become cam_0, cam_1 ... in the natural order of their names."""
@@ -112,7 +112,7 @@ def _one_take(take: Take, folder: Path, options: IngestOptions, tick: Tick) -> d
             film, alignment.frames[camera], folder / camera, options.max_side,
             lambda done, i=i: tick(take.source, i * count + done, len(films) * count),  # type: ignore[misc]
         )  # fmt: skip
-    write_sheet(folder / "sync.png", thumbnails)
+    _write_sheet(folder / "sync.png", thumbnails)
     write_json(marker, found)
     return found
 
@@ -179,6 +179,21 @@ def _write_camera(
     if len(small) != len(indices):
         raise DataError(f"{film.path}: {len(indices)} frames are needed, {len(small)} can be decoded.")
     return [small[place] for place in range(len(indices))]
+
+
+def _write_sheet(path: Path, thumbnails: Mapping[str, list[np.ndarray]]) -> None:
+    """Writes a PNG to check the synchronisation by eye: small pictures around the fastest motion, a camera per row."""
+    cameras = list(thumbnails.values())
+    motion = sum(np.abs(np.diff(np.stack(frames).astype(np.float32), axis=0)).mean((1, 2, 3)) for frames in cameras)
+    count = len(cameras[0])
+    first = int(np.clip(np.argmax(motion) + 1 - MOMENTS // 2, 0, max(0, count - MOMENTS))) if count > 1 else 0
+    rows = [
+        np.hstack([cv2.resize(f, (THUMBNAIL, THUMBNAIL)) for f in frames[first : first + MOMENTS]])
+        for frames in cameras
+    ]
+    for row, name in zip(rows, thumbnails, strict=True):
+        cv2.putText(row, f"{name}, frames from {first}", (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 60, 60), 1)
+    write_picture(path, np.vstack(rows))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -31,13 +31,13 @@ PACKAGES = ("mujoco", "numpy", "scipy", "torch", "opencv-python-headless")
 def synthesize(out: Path, plan: Plan, *, workers: int, overwrite: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Makes a set."""
     stage = Stage("synthesize", REVISION, {}, asdict(plan), PACKAGES)
-    return run_stage(stage, out, lambda work: _write_all(work, plan, workers, tick), overwrite=overwrite)
-
-
-def _write_all(root: Path, plan: Plan, workers: int, tick: Tick) -> dict[str, Any]:
     jobs = [(name, part) for name in plan.objects for part in (None, *range(plan.sequences))]
-    each(_write_part, [(root, plan, *job) for job in jobs], workers=workers, step="synthesizing", tick=tick)
-    return {"objects": list(plan.objects)}
+
+    def make(work: Path) -> dict[str, Any]:
+        each(_write_part, [(work, plan, *job) for job in jobs], workers=workers, step="synthesizing", tick=tick)
+        return {"objects": list(plan.objects)}
+
+    return run_stage(stage, out, make, overwrite=overwrite)
 
 
 def _write_part(root: Path, plan: Plan, name: str, sequence: int | None) -> None:

@@ -88,7 +88,10 @@ class BlenderProcess:
             if stop.is_set():
                 raise BlenderError("stopped, because another job failed.")
             if code != 0:
-                raise BlenderError(f"Blender gave up (exit code {code}):\n{_tail(said)}")
+                said.seek(0)
+                lines = [line.rstrip() for line in said if line.strip() and not line.startswith("Fra:")]
+                told_last = "\n".join(lines[-TAIL:]) or "(it said nothing)"
+                raise BlenderError(f"Blender gave up (exit code {code}):\n{told_last}")
 
 
 def _cores() -> SimpleQueue[int]:
@@ -119,12 +122,6 @@ def _give(
             if stop.is_set():
                 return
     process.wait()
-
-
-def _tail(said: Any) -> str:
-    said.seek(0)
-    lines = [line.rstrip() for line in said if line.strip() and not line.startswith("Fra:")]
-    return "\n".join(lines[-TAIL:]) or "(it said nothing)"
 
 
 def default_python() -> Path:

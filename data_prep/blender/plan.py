@@ -173,17 +173,12 @@ def frame_entries(plan: Plan, surface: Surface) -> list[dict[str, Any]]:
     poses = _poses(surface, [(math.radians(azimuth), math.radians(elevation)) for azimuth, elevation in angles])
     return [
         {
-            "file_path": frame_name(view, frame), "camera": view, "frame": frame, "time": frame / FPS,
+            "file_path": f"{view}/{frame:04d}.png", "camera": view, "frame": frame, "time": frame / FPS,
             "heldout": i >= trained, "transform_matrix": pose,
         }
         for frame in range(plan.frames)
         for i, (view, pose) in enumerate(zip(plan.view_names, poses, strict=True))
     ]  # fmt: skip
-
-
-def frame_name(view: str, frame: int) -> str:
-    """A frame's file within its sequence."""
-    return f"{view}/{frame:04d}.png"
 
 
 def _poses(surface: Surface, angles: list[tuple[float, float]]) -> list[list[list[float]]]:

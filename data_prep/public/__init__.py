@@ -24,7 +24,6 @@ REVISION = 1
 KINDS = {
     "ready": "READY in the layout of its authors (the paper's captured data)",
     "springgaus": "Spring-Gaus: synthetic falls, films of real falls",
-    "pacnerf": "PAC-NeRF: falls before an empty plate",
     "physdreamer": "PhysDreamer: stills, Gaussians, and films from one place",
 }
 PACKAGES = ("av", "numpy", "opencv-python-headless", "pycolmap", "scipy")

@@ -10,7 +10,6 @@ import numpy as np
 
 from data_prep.common.photos import open_photo
 from gausim.core.errors import DataError
-from gausim.io.files import slashed
 from gausim.io.plain_json import checked, read_any_json
 
 # Larger numbers indicate damage: they would overflow float32 in later computations.
@@ -89,15 +88,6 @@ def viewmat(value: Any, where: str, *, opengl: bool = False, inverse: bool = Fal
         matrix[:3, 3] = -turn.T @ matrix[:3, 3]
         matrix[:3, :3] = turn.T
     return OPENGL_TO_OPENCV @ matrix if opengl else matrix
-
-
-def inside(folder: Path, name: str, where: str) -> Path:
-    """The path of a file by its name within a folder."""
-    name = slashed(folder, name)
-    parts = Path(name).parts if name.isprintable() and 0 < len(name) <= 1000 else ()
-    if not parts or Path(name).is_absolute() or ".." in parts or any(len(part.encode()) > 255 for part in parts):
-        raise DataError(f"{where}: expected a file name inside {folder}, got {name!r:.80}. {REMEDY}")
-    return folder / name
 
 
 def check_name(name: str, where: str) -> str:

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import public_sets
 from helpers.public_sets import FRAMES, Sample
 
 from data_prep.public import import_public, main
@@ -67,15 +66,6 @@ def test_smaller_pictures_and_views_held_out(sample_of: SampleOf, tmp_path: Path
     assert len(data.stills().images) == 2 and data.sequences[0].cameras.width == 24
     with pytest.raises(ConfigError, match="--heldout camera_7"):
         imported("springgaus", root, tmp_path / "no", heldout=("camera_7",))
-
-
-def test_pac_nerf_with_and_without_masks(sample_of: SampleOf, tmp_path: Path) -> None:
-    sample = public_sets.write_pacnerf(tmp_path / "bird", rgba=True)
-    data, _ = imported("pacnerf", sample.root, tmp_path / "out")
-    assert data.fps == pytest.approx(24) and data.facts["floor"]["point"] == [0, 0, 0]
-    check_views(data, sample, 1.0)
-    manifest = import_public("pacnerf", sample_of("pacnerf").root, tmp_path / "bare")
-    assert manifest["results"]["without_alpha"] == ["seq_000"]
 
 
 def test_pins_are_read(tmp_path: Path) -> None:
@@ -155,8 +145,6 @@ DAMAGE: list[tuple[str, str, Callable[[Any], Any] | None, str]] = [
     ("springgaus", "frame.json", put(3, to={"t": 0.5}), "equal steps"),
     ("springgaus", "camera_1/003.png", None, "frame 3 is missing"),
     ("springgaus", "camera_1/003.png", narrow, "is for 48x48"),
-    ("pacnerf", "all_data.json", put(3, "file_path", to="../r_0_3.png"), "inside"),
-    ("pacnerf", "all_data.json", put(3, "c2w", 0, 3, to=9.0), "stands still"),
     ("physdreamer", "sparse/0/images.bin", lambda data: data[:-9], "truncated"),
     ("physdreamer", "images/frame_00003.png", narrow, "another shape"),
     ("physdreamer", "videos/frame_00002_poke.mp4", lambda data: data[:300], ""),

@@ -76,23 +76,6 @@ def write_springgaus(root: Path) -> Sample:
     return sample
 
 
-def write_pacnerf(root: Path, *, rgba: bool = False) -> Sample:
-    """One object, `data/<obj>/`, with frames before a plate and, with ``rgba``, cut out."""
-    sample, entries = falling(root, (0, 1, 0), 1 / 24, 1.0), []
-    y, x = np.mgrid[:SIZE, :SIZE]
-    for v in range(3):
-        plate = np.stack((60 + x, 90 + y // 2, 120 - x // 2 + 10 * v), -1).astype(np.uint8)
-        save(root / "data" / f"r_{v}_-1.png", plate)
-        for f in range(FRAMES):
-            save(root / "data" / f"r_{v}_{f}.png", before(sample.image(f, v), plate))
-            if rgba:
-                save(root / "data" / f"a_{v}_{f}.png", sample.image(f, v))
-            entries.append({"file_path": f"./data/r_{v}_{f}.png", "time": f / 24, "c2w": sample.gl_poses[v][:3],
-                            "intrinsic": K.tolist()})  # fmt: skip
-    dump(root / "all_data.json", entries)
-    return sample
-
-
 def write_gaussians(root: Path) -> toy_object.ToyObject:
     """A toy object with the point clouds of READY and PhysDreamer."""
     toy = toy_object.ToyObject(root, toy_object.toy_scene(), frames=FRAMES)
@@ -176,6 +159,6 @@ def dump(path: Path, data: Any) -> None:
 
 
 WRITERS = {
-    "springgaus": (write_springgaus, "render/torus"), "pacnerf": (write_pacnerf, "data/bird"),
+    "springgaus": (write_springgaus, "render/torus"),
     "physdreamer": (write_physdreamer, "physics_dreamer/hat"), "ready": (write_ready, "ready/duck"),
 }  # fmt: skip

@@ -13,16 +13,6 @@ from data_prep.capture.cameras.world import centers
 from gausim.io.colmap import PointTable
 
 
-def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of a photo's (m,) keypoints that show a point of the table, and the rows of these points."""
-    if not len(points.ids):
-        return np.zeros(len(shot.point_ids), bool), np.zeros(0, int)
-    order = np.argsort(points.ids)
-    rows = order[np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=len(order) - 1)]
-    known = points.ids[rows] == shot.point_ids
-    return known, rows[known]
-
-
 def reprojection(points: PointTable) -> dict[str, Any]:
     """Mean distance between where photos show points and where their cameras see them, as COLMAP states it [pixels]."""
     count = int(points.tracks.sum())
@@ -32,15 +22,17 @@ def reprojection(points: PointTable) -> dict[str, Any]:
 def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:
     """(P, 3) uint8 RGB: the mean of the pixels that show each point."""
     total, count = np.zeros((len(points.ids), 3)), np.zeros(len(points.ids))
-    for shot in posed:
-        known, rows = _observations(shot, points)
+    order = np.argsort(points.ids)
+    for shot in posed if len(order) else ():
+        rows = order[np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=len(order) - 1)]
+        known = points.ids[rows] == shot.point_ids
         if not known.any():
             continue
         pixels = shot.photo.read()
         x = shot.xy[known, 0].astype(int).clip(0, shot.photo.width - 1)
         y = shot.xy[known, 1].astype(int).clip(0, shot.photo.height - 1)
-        np.add.at(total, rows, pixels[y, x, :3])
-        np.add.at(count, rows, 1)
+        np.add.at(total, rows[known], pixels[y, x, :3])
+        np.add.at(count, rows[known], 1)
     return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
 
 

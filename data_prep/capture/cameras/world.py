@@ -13,9 +13,6 @@ from data_prep.capture.cameras.sources import Posed
 from data_prep.common.command import Options, option
 from gausim.core.errors import ConfigError, DataError
 
-# Centres on a line have no plane: ratio of the second to the first extent below which there is none.
-_FLAT = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
@@ -42,8 +39,8 @@ class WorldOptions(Options):
     """The world that poses are brought to."""
 
     up: str | None = option(
-        None, "turn z up: by the mean up of the 'cameras' (default for found poses), the 'plane' of their centres, a "
-        "vector X,Y,Z, or 'keep' (default for poses that are taken over)", metavar="RULE",
+        None, "turn z up: by the mean up of the 'cameras' (default for found poses), a vector X,Y,Z, or "
+        "'keep' (default for poses that are taken over)", metavar="RULE",
     )  # fmt: skip
     scale: float | None = option(
         None, "scale the world by this factor, such as metres by a length that you know in it "
@@ -78,7 +75,9 @@ def place(found: Sequence[Posed], options: WorldOptions, *, mapped: bool) -> tup
     viewmats = np.stack([shot.viewmat for shot in found])
     rule = options.up if options.up is not None else ("cameras" if mapped else "keep")
     kept = rule == "keep"
-    rotation, middle = np.eye(3), _looked_at(viewmats)
+    eyes = centers(viewmats)
+    rotation, middle = np.eye(3), nearest_to_lines(eyes, viewmats[:, 2, :3])
+    middle = eyes.mean(0) if middle is None else middle
     if not kept:  # the smallest rotation that turns up to z
         rotation = Rotation.align_vectors([[0.0, 0.0, 1.0]], [_up(rule, viewmats)])[0].as_matrix()
     facts: dict[str, Any] = {"up": "as given" if kept else "z", "up_rule": rule}
@@ -86,17 +85,11 @@ def place(found: Sequence[Posed], options: WorldOptions, *, mapped: bool) -> tup
     if options.scale is not None or not mapped:
         scale, facts["unit"] = options.scale or 1.0, "as given"
     else:
-        scale = 1 / max(float(np.linalg.norm(centers(viewmats) - middle, axis=1).mean()), 1e-12)
+        scale = 1 / max(float(np.linalg.norm(eyes - middle, axis=1).mean()), 1e-12)
         facts["unit"] = "mean distance of the cameras from what they look at"
     move = Similarity(scale, rotation, scale * (-rotation @ middle) if mapped else np.zeros(3))
     facts.update(scale=move.scale, rotation=move.rotation.tolist(), shift=move.shift.tolist())
     return move, facts
-
-
-def _looked_at(viewmats: np.ndarray) -> np.ndarray:
-    """The point (3,) nearest to all optical axes of cameras (n, 4, 4); their middle where the axes are parallel."""
-    point = nearest_to_lines(centers(viewmats), viewmats[:, 2, :3])
-    return centers(viewmats).mean(0) if point is None else point
 
 
 def _up(rule: str, viewmats: np.ndarray) -> np.ndarray:
@@ -106,22 +99,13 @@ def _up(rule: str, viewmats: np.ndarray) -> np.ndarray:
     if rule == "cameras":
         length = float(np.linalg.norm(level))
         if length < 0.1:
-            raise DataError("the cameras have no common up: give it with --up plane or --up X,Y,Z.")
+            raise DataError("the cameras have no common up: give it with --up X,Y,Z.")
         return level / length
-    if rule == "plane":
-        x = centers(viewmats)
-        _, extent, axes = np.linalg.svd(x - x.mean(0), full_matrices=False)
-        if len(x) < 3 or extent[1] < _FLAT * extent[0]:
-            raise DataError("the cameras stand in a line, which has no plane: give up with --up cameras or --up X,Y,Z.")
-        side = float(axes[2] @ level)
-        if abs(side) < 0.1:
-            raise DataError("the cameras' plane stands upright: give up with --up cameras or --up X,Y,Z.")
-        return axes[2] * np.sign(side)
     try:
         direction = np.array([float(word) for word in rule.split(",")])
     except ValueError:
         direction = np.zeros(0)
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not 1e-9 < length < 1e9:
-        raise ConfigError(f"--up '{rule}': expected cameras, plane, keep, or three numbers like 0,-1,0.")
+        raise ConfigError(f"--up '{rule}': expected cameras, keep, or three numbers like 0,-1,0.")
     return direction / length
