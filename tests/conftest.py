@@ -98,7 +98,7 @@ def _played(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 def played(_played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """A run that was never trained, which is what loading any run gives; not to be changed."""
     # All who name it at their top are imported before it is replaced at home.
-    names = ("cli.inspect_material", "cli.simulate_run", "cli.evaluate_run", "api", "compose.build")
+    names = ("cli.simulate_run", "cli.evaluate_run", "api", "compose.build")
     for home in names:
         monkeypatch.setattr(f"gausim.{home}.load_run", lambda path, **_: _played)
     return _played

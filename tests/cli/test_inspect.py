@@ -1,14 +1,11 @@
 """`gausim inspect`: figures, picture, masks, and the way out where nothing is pinned."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
-import numpy as np
 import pytest
 import torch
 from helpers.plain import plain_scene
-from plyfile import PlyData
 
 from gausim.cli import inspect as command
 from gausim.cli.main import main
@@ -49,28 +46,3 @@ def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixtu
 def test_the_default_hierarchy_is_that_of_the_model() -> None:
     levels = compose(["model=gausim"]).model.simulator.hierarchy.levels
     assert tuple(level.diameter for level in reversed(levels)) == command.DEFAULT_RADII
-
-
-@pytest.mark.parametrize("name", ["stiffness", "damping"])
-def test_material_as_picture_and_ply(played: SimpleNamespace, tmp_path: Path, capsys, name: str) -> None:
-    out = tmp_path / f"{name}.png"
-    assert main(["inspect", str(played.run_dir), "--property", name, "--azimuths", "30", "--out", str(out)]) == 0
-    told, ply = capsys.readouterr().out, out.with_suffix(".ply")
-    assert name in told and f"PLY        {ply}" in told
-    image = cv2.imread(str(out))
-    assert image is not None and image.shape[1] > 400
-    colored, scene = load_scene(ply), played.module.model.scenes[0]
-    free, values = scene.simulated & ~scene.pinned, torch.from_numpy(np.array(PlyData.read(ply)["vertex"][name]))
-    assert f"{int(free.sum())} of 36 move" in told and (values[free] > 0).all() and (values[~free] == 0).all()
-    assert torch.equal(colored.means, scene.means) and torch.equal(colored.pinned, scene.pinned)
-    assert colored.sh_degree == 0 and len(colored.sh[~free].unique(dim=0)) == 1
-
-
-def test_a_trained_run_tells_what_it_has_learned_and_no_more(toy_run: Path, tmp_path: Path, capsys) -> None:
-    asked = ["inspect", str(toy_run), "--out", str(tmp_path / "m.png"), "--property"]
-    assert main([*asked, "density"]) == 0
-    assert "density over that at the beginning of training" in capsys.readouterr().out
-    values = PlyData.read(tmp_path / "m.ply")["vertex"]["density"]
-    assert len(np.unique(values[values > 0])) > 1
-    assert main([*asked, "stiffness"]) == 2
-    assert "has learned density. Take one of these, or a run of model=gausim" in capsys.readouterr().err

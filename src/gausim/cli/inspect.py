@@ -1,4 +1,4 @@
-"""`gausim inspect`: statistics of a scene and of its hierarchy, or the material that a run has learned."""
+"""`gausim inspect`: statistics of a scene and of its hierarchy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import UPS, add_data_option, add_names, add_pin_option, command_parser, pinned_by
+from gausim.cli.arguments import UPS, add_pin_option, command_parser, pinned_by
 from gausim.core.errors import SceneError
 
 if TYPE_CHECKING:
@@ -16,16 +16,11 @@ if TYPE_CHECKING:
 
 # The hierarchy of conf/model/gausim.yaml; composing it here would be slow.
 DEFAULT_RADII = (0.125, 0.55)
-PROPERTIES = ("stiffness", "density", "damping")
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    if arguments.property is not None:
-        from gausim.cli.inspect_material import show_material
-
-        return show_material(arguments)
     from gausim.io.ply import load_scene, masks_path, save_masks
     from gausim.models.hierarchy.clusters import build_hierarchy
 
@@ -56,7 +51,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("inspect")
     add = parser.add_argument
-    add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY), or a RUN with --property")
+    add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY)")
     add("--masks", metavar="FILE", type=Path, help="read these masks (npz; default: <stem>.masks.npz, if there)")
     add_pin_option(parser)
     add("--simulate", action="append", default=[], metavar="SIDE", help="simulate only kernels on this side, e.g. "
@@ -70,14 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--up", choices=UPS,
         help="draw this axis upwards (write --up=-y; default: away from the pins, else z)")  # fmt: skip
     add("--out", metavar="PICTURE.png", type=Path,
-        help="write this picture (default: <stem>.clusters.png, of a property OBJECT.PROPERTY.png)")  # fmt: skip
-    learned = parser.add_argument_group("the material that a run has learned")
-    learned.add_argument("--property", choices=PROPERTIES, help="colour the Gaussians by it: a picture, and a PLY "
-                         "with these colours and the property")  # fmt: skip
-    add_names(learned, "objects", "colour this object of the run (default: its first)", several=False)
-    learned.add_argument("--azimuths", type=float, nargs="+", default=[30.0, 210.0], metavar="DEGREE",
-                         help="look from these sides (default: 30 210)")  # fmt: skip
-    add_data_option(parser)
+        help="write this picture (default: <stem>.clusters.png)")  # fmt: skip
     return parser
 
 
