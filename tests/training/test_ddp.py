@@ -14,8 +14,11 @@ import pytest
 import yaml
 from helpers.plain import digest
 from helpers.toy_runs import Trainings, assert_same_run, killed, rows
+from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.runs.checkpoint import read_checkpoint
+from gausim.training.ranks.launch import claim_first
+from gausim.training.trainer import TrainerSettings, make_trainer
 
 # The static loss is one rank's: all that could depend on which rank computes a sequence.
 ALL = {"static_probability": 1.0}
@@ -180,3 +183,15 @@ def test_ranks_that_a_scheduler_has_started_meet_and_train(trainings: Trainings,
     assert "2 ranks" in outputs[0] and "Trained for 3 epochs" in outputs[0] and "Trained" not in outputs[1]
     found, expected = (read_checkpoint(r / "last.ckpt")["state_dict"] for r in (run, whole))
     assert digest(found) == digest(expected)
+
+
+def test_variables_that_slurm_has_left_start_no_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
+    left = {"SLURM_NTASKS": "4", "SLURM_PROCID": "3", "SLURM_LOCALID": "3", "SLURM_JOB_NAME": "train"}
+    for name, value in left.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(rank_zero_only, "rank", 3)
+    claim_first({"devices": 2, "num_nodes": 1})
+    assert rank_zero_only.rank == 3
+    claim_first({"devices": 1, "num_nodes": 1})
+    trainer = make_trainer(TrainerSettings(progress=False, accelerator="cpu"), epochs=1)
+    assert rank_zero_only.rank == 0 and trainer.is_global_zero and trainer.world_size == 1

@@ -42,6 +42,7 @@ def main(argv: list[str]) -> int:
 
     from gausim.cli.training_run import train_run
     from gausim.runs.directory import RunDirectory
+    from gausim.training.ranks.launch import claim_first
 
     source = RunDirectory(arguments.run)
     config = _config(source.config(), source.path, arguments)
@@ -49,6 +50,7 @@ def main(argv: list[str]) -> int:
     path = source.path.resolve()
     beside = path.parent.with_name(f"{path.parent.name}_adapted_{arguments.frames}") / path.name
     run = RunDirectory(arguments.out or beside)
+    claim_first(config["trainer"])
     with run.writing():
         train_run(OmegaConf.create(config), run)
     return 0

@@ -40,7 +40,9 @@ def train(cfg: DictConfig) -> object:
     from gausim.compose.command import run_dir
     from gausim.compose.root import in_sweep
     from gausim.runs.directory import RunDirectory
+    from gausim.training.ranks.launch import claim_first
 
+    claim_first(cfg.trainer)
     run = RunDirectory(run_dir())
     if in_sweep():
         return do_job(cfg, run, train_run)

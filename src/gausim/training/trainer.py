@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import LightningEnvironment
 
 from gausim.core import ConfigError
 from gausim.runs.checkpoint import AtomicCheckpointIO
@@ -87,5 +88,6 @@ def make_trainer(
         limit_val_batches=0,
         use_distributed_sampler=False,  # our sampler divides the batches
         default_root_dir=None if run_dir is None else str(run_dir),
-        plugins=[AtomicCheckpointIO()],
+        # One process is alone, whatever variables a scheduler has left.
+        plugins=[AtomicCheckpointIO(), *[LightningEnvironment()] * (settings.size == 1)],
     )

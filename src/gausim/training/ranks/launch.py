@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
@@ -16,6 +16,7 @@ from lightning.fabric.utilities.seed import reset_seed
 from lightning.pytorch.plugins.environments import ClusterEnvironment, SLURMEnvironment, TorchElasticEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.strategies.launchers.subprocess_script import _SubprocessScriptLauncher
+from lightning.pytorch.utilities import rank_zero_only
 from torch import distributed as dist
 
 from gausim.core import ConfigError, GausSimError, RunError
@@ -90,6 +91,12 @@ class RanksStrategy(DDPStrategy):
         assert self.model is not None
         for tensor in (*self.model.parameters(), *self.model.buffers()):
             dist.broadcast(tensor.detach(), src=0)
+
+
+def claim_first(trainer: Mapping[str, Any]) -> None:
+    """Makes this process the first rank where one is asked for, whatever variables a scheduler has left."""
+    if trainer.get("devices", 1) == trainer.get("num_nodes", 1) == 1:
+        rank_zero_only.rank = 0  # type: ignore[attr-defined]
 
 
 @contextmanager
