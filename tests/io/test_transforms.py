@@ -72,6 +72,7 @@ def test_blenders_own_layout(tmp_path: Path) -> None:
     ({"frames": []}, "field 'frames' must be a non-empty list"),
     ({"fl_x": None, "camera_angle_x": None}, "neither field 'fl_x'"),
     ({"fl_x": "wide"}, "field 'fl_x' must be a finite number"),
+    ({"fl_x": 9.0, "camera_angle_x": 1.5}, r"'fl_x' \(9 pixels\) and 'camera_angle_x' \(1.5 radian.* contradict"),
     ({"fl_x": None, "camera_angle_x": 0}, "'camera_angle_x' must be between 0 and pi"),
     ({"h": 0}, "fields 'w', 'h' must be positive"),
     ({"k1": 0.02}, r"the lens is distorted \(\{'k1': 0.02\}\)"),
@@ -178,6 +179,7 @@ VALUES = {
 def outcome(tmp_path: Path, field: str) -> str:
     """What the reader makes of a field of all entries."""
     own = {"fl_x": None, "fl_y": None, "camera_angle_x": 0.9} if field.startswith("camera_angle") else {}
+    own |= {"camera_angle_x": None} if field in ("w", "h") else {}  # which would contradict the focal length
     before = read_transforms(written(tmp_path, **own))
     path = written(tmp_path, **own)
     data = json.loads(path.read_text())

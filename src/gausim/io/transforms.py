@@ -37,6 +37,8 @@ LEFT_ASIDE = (
 )  # fmt: skip
 IMAGE_SUFFIXES = (*SUFFIXES, ".PNG", ".JPG", ".JPEG", ".TIF", ".TIFF")
 _LONGEST_NAME = 255
+# Relative difference of focal lengths above which two fields contradict each other.
+_SAME_FOCAL = 0.02
 _Row = tuple[float, float, float, float]
 # OpenGL cameras look along -z with y up, OpenCV cameras along +z with y down.
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
@@ -278,9 +280,16 @@ def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Flo
 
 def _focal(fields: dict[str, Any], axis: str, length: int, field: str) -> float | None:
     """Focal length along an axis [pixels] by ``fl_x`` or ``camera_angle_x``; None where neither is there."""
-    key = f"camera_angle_{axis}"
+    key, angle = f"camera_angle_{axis}", fields.get(f"camera_angle_{axis}")
     if f"fl_{axis}" in fields:
-        return number_field(fields, f"fl_{axis}", field)
+        focal = number_field(fields, f"fl_{axis}", field)
+        by_angle = length / (2 * math.tan(angle / 2)) if isinstance(angle, float) and 0 < angle < math.pi else focal
+        if focal > 0 and abs(by_angle - focal) > _SAME_FOCAL * focal:
+            raise DataError(
+                f"{field}: fields 'fl_{axis}' ({focal:g} pixels) and '{key}' ({angle:g} radian, which is "
+                f"{by_angle:.4g} pixels) contradict each other. Take one of them out."
+            )
+        return focal
     if key not in fields:
         return None
     angle = number_field(fields, key, field)
