@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,9 +108,22 @@ def _run(hydra: Hydra, name: str, job: Job, words: list[str], *, sweep: bool) ->
         if error.filename is None:  # a full disk does not say of which file
             given = (word.partition("=")[2] for word in words if word.startswith("output_root="))
             error.filename = next(given, "outputs")
+        if not sweep:
+            composed = hydra.compose_config(name, words, run_mode=RunMode.RUN, with_log_configuration=False)
+            _remove_traces(Path(composed.hydra.run.dir))
         raise
     if job.error is not None:
         raise job.error
+
+
+def _remove_traces(folder: Path) -> None:
+    """Removes the empty files that Hydra made in a run directory before a full disk stopped it."""
+    for path in (folder / "train.log", *folder.glob(".hydra/*")):
+        if path.is_file() and not path.stat().st_size:
+            path.unlink()
+    for path in (folder / ".hydra", folder, folder.parent):
+        with suppress(OSError):  # it holds more, or is not there
+            path.rmdir()
 
 
 def run_dir() -> Path:
