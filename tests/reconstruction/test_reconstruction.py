@@ -13,12 +13,11 @@ from helpers.plain import cameras_at, plain_scene
 from torch import Tensor
 
 from gausim.cli.main import main
-from gausim.core import Cameras, ConfigError, DataError, GaussianScene
+from gausim.core import Cameras, DataError, GaussianScene
 from gausim.data.images import write_rgba
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
-from gausim.ops.spherical_harmonics import evaluate_sh
-from gausim.reconstruction.reconstruction import ROUNDS, ReconstructionOptions, reconstruct
+from gausim.reconstruction.reconstruction import ReconstructionOptions, reconstruct
 from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet, measure, reduced
@@ -108,40 +107,6 @@ def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
     assert (scene.means.amin(0) - whole.means.amin(0)).abs().max() < 0.1
 
 
-def walled(stills: ImageSet) -> ImageSet:
-    """The same stills with something behind the object: all of the image counts."""
-    rgb, alpha = stills.images[..., :3].float(), stills.images[..., 3:].float() / 255
-    wall = torch.tensor([40.0, 90.0, 60.0])
-    pixels = (rgb * alpha + wall * (1 - alpha)).round()
-    return ImageSet("photos", torch.cat((pixels, torch.full_like(alpha, 255)), -1).to(torch.uint8), stills.cameras)
-
-
-def shell() -> PointCloud:
-    """Points of the two balls and of a far sphere around everything."""
-    g = torch.Generator().manual_seed(5)
-    around = 6 * torch.nn.functional.normalize(torch.randn(700, 3, generator=g), dim=-1)
-    near = evaluate_sh(true_scene().sh[::2], torch.tensor([0.0, 0.0, 1.0]).expand(75, 3))
-    far = (torch.tensor([40.0, 90.0, 60.0]) / 255).expand(700, 3)
-    return PointCloud(torch.cat((true_scene().means[::2], around)), torch.cat((near, far)))
-
-
-def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ROUNDS, "scene", 6)  # more would need more steps
-    photos = walled(stills)
-    settings = {"kernels": 1000, "iterations": 250, "extent": "scene"}
-    options = ReconstructionOptions(**settings, minimum_opacity=0.01, anisotropy_limit=10.0)
-    train, left_out = photos.select(range(20)), photos.select(range(20, 24))
-    scene = reconstruct([train], RENDERER, options, cloud=shell())
-    figures = measure(scene, RENDERER, left_out)
-    assert 775 < scene.count <= 1000
-    assert figures["psnr"] > 28 and figures["psnr"] == pytest.approx(figures["psnr_foreground"])
-    assert (scene.means.norm(dim=-1) > 3).any()  # what lies behind is there too
-    with pytest.raises(ConfigError, match="starts from points"):
-        reconstruct([train], RENDERER, options)
-    with pytest.raises(DataError, match="need colours"):
-        reconstruct([train], RENDERER, options, cloud=PointCloud(shell().points))
-
-
 def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
     half = reduced(replace(stills, weight=0.3), 0.5)
     assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.weight == 0.3
@@ -220,22 +185,24 @@ def test_command_pins_below_the_height_that_the_data_set_states(stills: ImageSet
         assert torch.equal(scene.pinned, scene.means[:, 2] < height) and scene.pinned.any()
 
 
-def test_command_takes_photos_without_masks_as_a_scene(stills: ImageSet, tmp_path: Path, capsys) -> None:
+def test_command_refuses_photos_without_masks_and_begins_at_given_points(
+    stills: ImageSet, tmp_path: Path, capsys
+) -> None:
     def without_alpha(path: Path, image: Tensor) -> None:
         assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., :3].flip(-1).numpy()))
 
-    command = [*written(walled(stills), tmp_path, without_alpha), "--iterations", "30"]
-    assert main(command) == 2
+    (tmp_path / "bare").mkdir()
+    assert main([*written(stills, tmp_path / "bare", without_alpha), "--iterations", "30"]) == 2
     assert "got 40x40 RGB" in capsys.readouterr().err
-    command += ["--extent", "scene"]
-    assert main(command) == 2
-    assert "starts from points" in capsys.readouterr().err
-    points, colors = shell().points.numpy(), (255 * shell().colors).to(torch.uint8).numpy()
+    command = [*written(stills, tmp_path, write_rgba), "--iterations", "30", "--kernels", "90"]
+    points = true_scene().means.numpy()
+    colors = np.full(points.shape, 90, np.uint8)
+    command += ["--points", str(tmp_path / "points.npz")]
     np.savez(tmp_path / "points.npz", points=points, colors=colors)
-    assert main([*command, "--leave-out", "12", "--longest", "30", "--kernels", "900"]) == 0
+    assert main([*command, "--leave-out", "12", "--longest", "30"]) == 0
     measured = json.loads((tmp_path / "scene.json").read_text())["measured"]
     assert measured["stills left out"]["images"] == 2 and measured["stills to train on"]["images"] == 22
     assert not list(tmp_path.glob(".*"))
     np.savez(tmp_path / "points.npz", points=points, colors=colors[:3])
     assert main(command) == 2
-    assert "'colors' must be (775, 3)" in capsys.readouterr().err
+    assert f"'colors' must be ({len(points)}, 3)" in capsys.readouterr().err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from functools import reduce
 from operator import or_
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.main import COMMANDS
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gausim.core.scene import GaussianScene
-    from gausim.interaction.interaction import Interaction
 
 
 # Vertical axes of scenes; a minus where the axis points down.
@@ -87,32 +85,6 @@ def pinned_by(scene: GaussianScene, sides: list[str], *, below_z: float | None =
         sides = [] if below_z is None else [f"below z={below_z}"]
     chosen: list[Selection] = [parse_half_space(side) for side in sides]
     return apply_masks(scene, pinned=reduce(or_, chosen)) if chosen else scene
-
-
-def add_scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Adds the options of a scene without videos, which :func:`opened_scene` reads; returns their group."""
-    group = parser.add_argument_group("a scene without a run")
-    add = group.add_argument
-    add("--from", dest="base", metavar="RUN", type=Path, help="move the scene by the network of this run")
-    add("--stiffness", type=float, metavar="S",
-        help="let the slowest swing take S^(-1/2) seconds (default with --from: 1)")  # fmt: skip
-    add("--damping", type=float, metavar="D",
-        help="let amplitudes fall as exp(-D t / 2) [1 / s] (default with --from: 0.5)")  # fmt: skip
-    add("--fps", type=float, default=30.0, help="simulate so many frames per second (default: 30)")
-    add("--seed", type=int, default=0, help="draw the weights of an untrained model with this seed (default: 0)")
-    return group
-
-
-def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options: Any) -> Interaction:
-    """The scene with the model of :func:`add_scene_options`; ``options`` are those of `open_scene`.
-
-    Raises:
-        ConfigError: a number is not positive.
-    """
-    from gausim.compose.unfilmed import open_scene
-
-    names = ("fps", "base", "seed", "stiffness", "damping", "device")
-    return open_scene(scene, **{name: getattr(arguments, name) for name in names}, **options)
 
 
 def positive(text: str) -> int:

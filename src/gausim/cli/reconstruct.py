@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 # Images side by side in the comparison picture.
 COMPARED = 5
 LEFT_OUT_COMPARED = 2
-# An open scene has parts of all sizes that occlude each other, and grows from few points.
-SCENE_OPTIONS: dict[str, Any] = {"kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0}
 
 
 def main(argv: list[str]) -> int:
@@ -70,7 +68,7 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
-    name, material, cloud, below_z = _inputs(source, arguments, options)
+    name, material, cloud, below_z = _inputs(source, arguments)
     renderer = CpuRenderer()
     start = time.process_time()
     scene = pinned_by(_fit(material, renderer, options, cloud, name), arguments.pin, below_z=below_z)
@@ -91,21 +89,14 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options of the reconstruction."""
     add = parser.add_argument
-    add("--extent", default="object", choices=("object", "scene"),
-        help="fit the object (the stills' alpha) or the scene (whole stills) (default %(default)s)")  # fmt: skip
-    add("--kernels", type=int, metavar="N", help="aim at N Gaussians (default 2000, of a scene 30000)")
-    add(
-        "--iterations",
-        type=int,
-        default=4000,
-        metavar="N",
-        help="make N optimiser steps, one image each (default %(default)s)",
-    )
+    add("--kernels", type=int, default=2000, metavar="N", help="aim at N Gaussians (default %(default)s)")
+    add("--iterations", type=int, default=4000, metavar="N", help="make N optimiser steps, one image each (default "
+        "%(default)s)")  # fmt: skip
     add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="harmonics of this degree (default %(default)s)")
-    add("--anisotropy", type=float, metavar="R", help="penalise a length over width of a kernel above R (default 3, "
-        "of a scene 10)")  # fmt: skip
+    add("--anisotropy", type=float, default=3.0, metavar="R", help="penalise a length over width of a kernel above R "
+        "(default %(default)s)")  # fmt: skip
     add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
-        "of the masks' visual hull; of a scene the default is points.npz beside --transforms")  # fmt: skip
+        "of the masks' visual hull")  # fmt: skip
     add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="let this fraction of the stills "
         "have masks that lack a part that all others show (default %(default)s)")  # fmt: skip
     add("--video-share", type=float, default=0.5, metavar="FRACTION",
@@ -122,43 +113,27 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
 def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
     from gausim.reconstruction.reconstruction import ReconstructionOptions
 
-    given = {"kernels": arguments.kernels, "anisotropy_limit": arguments.anisotropy}
-    chosen = {name: value for name, value in given.items() if value is not None}
-    defaults = SCENE_OPTIONS if arguments.extent == "scene" else {}
     return ReconstructionOptions(
-        iterations=arguments.iterations,
-        extent=arguments.extent,
-        sh_degree=arguments.sh_degree,
-        missing_masks=arguments.missing_masks,
-        seed=arguments.seed,
-        **{**defaults, **chosen},
-    )
+        kernels=arguments.kernels, anisotropy_limit=arguments.anisotropy, iterations=arguments.iterations,
+        sh_degree=arguments.sh_degree, missing_masks=arguments.missing_masks, seed=arguments.seed,
+    )  # fmt: skip
 
 
-def _inputs(
-    source: Path, arguments: argparse.Namespace, options: ReconstructionOptions
-) -> tuple[str, Material, PointCloud | None, float | None]:
+def _inputs(source: Path, arguments: argparse.Namespace) -> tuple[str, Material, PointCloud | None, float | None]:
     """Name, images, points to begin with, and the height below which the data set has its pins."""
     from gausim.data.objects import ObjectData
     from gausim.reconstruction.stills import gather_object, gather_stills
 
-    opaque = options.extent == "scene"
     if not 0 <= arguments.video_share < 1:
         raise DataError(f"--video-share: expected a fraction in [0, 1), got {arguments.video_share}.")
     if arguments.leave_out < 2:
         raise DataError(f"--leave-out: expected one still in 2 or more, got {arguments.leave_out}.")
     if source.name == "dataset.json":
-        if opaque:
-            raise DataError(
-                "--extent scene: a data set's sequences show an object. Take the transforms.json of stills."
-            )
         data = ObjectData(source.parent)
         material = gather_object(data, video_fraction=arguments.video_share)
         return data.name, material, _cloud(arguments.points), data.pinned_below_z
-    material = gather_stills(source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=0.5)
-    beside = source.parent / "points.npz"
-    points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
-    return source.parent.name or "scene", material, _cloud(points), None
+    material = gather_stills(source, every=arguments.leave_out, longest=arguments.longest, coarse=0.5)
+    return source.parent.name or "scene", material, _cloud(arguments.points), None
 
 
 def _cloud(path: str | None) -> PointCloud | None:

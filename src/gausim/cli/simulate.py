@@ -3,39 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 from gausim.cli.arguments import (
-    UPS,
     add_data_option,
     add_device_options,
     add_names,
-    add_scene_options,
     command_parser,
     computing,
     parse_background,
     positive,
 )
-from gausim.core.errors import ConfigError
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     parse_background(arguments.background)  # raises on a wrong value before the simulation
-    if (arguments.run is None) == (arguments.scene is None):
-        raise ConfigError("expected a RUN, or --scene SCENE.ply and the run whose network moves it, --from RUN.")
-    # Sides pin the scene before it begins, parts during the simulation.
-    given = [" ".join(words) for words in arguments.pin]
-    arguments.sides = [text for text in given if re.match(r"(below|above)\b|[xyz]\s*=", text)]
-    arguments.pin = [text.split() for text in given if text not in arguments.sides]
-    if arguments.run is not None and (arguments.sides or arguments.base):
-        raise ConfigError("--pin SIDE and --from: expected with --scene only. A run has its pins and its network.")
-    from gausim.cli.simulate_run import simulate_run, simulate_scene
+    from gausim.cli.simulate_run import simulate_run
 
     computing(arguments)
-    return simulate_run(arguments) if arguments.scene is None else simulate_scene(arguments)
+    return simulate_run(arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -49,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
     )
     add = parser.add_argument
-    add("run", metavar="RUN", nargs="?", type=Path, help="run directory of `gausim train`")
+    add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add_names(parser, "objects", "simulate these objects (default: all)")
     add_names(parser, "sequences", "simulate these sequences, or `all` (default: the first of each object)")
     add_names(parser, "cameras", "draw these (default: the first trained and the first held-out one)")
@@ -63,10 +51,4 @@ def _parser() -> argparse.ArgumentParser:
     add_device_options(parser)
     add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
-    group = add_scene_options(parser)
-    group.add_argument(
-        "--scene", metavar="SCENE.ply", type=Path, help="simulate this 3DGS scene; give --from, and pins if it has none"
-    )
-    group.add_argument("--up", choices=UPS, default="z", help="point the vertical axis so (write --up=-y; default: z)")
-    group.add_argument("--azimuth", type=float, default=0.0, metavar="DEGREE", help="look from there (default: 0)")
     return parser

@@ -1,4 +1,4 @@
-"""What `gausim simulate` does: predictions beside the truth, and objects or bare scenes under forces."""
+"""What `gausim simulate` does: predictions beside the truth, and objects under forces."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from msgspec.structs import replace
 from PIL import Image
 from torch import Tensor
 
-from gausim.cli.arguments import opened_scene, parse_background, pinned_by
+from gausim.cli.arguments import parse_background
 from gausim.cli.output import end, named_bar, push
 from gausim.compose.build import LoadedRun, load_run
-from gausim.compose.config import compose, instantiate
 from gausim.compose.data_paths import data_option
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import RunObject, run_object, run_objects, state_of
@@ -30,18 +29,12 @@ from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
 from gausim.interaction.replay import replay
 from gausim.interaction.session import ForceSession, load_session, save_session
 from gausim.interaction.words import entries_of, has_forces
-from gausim.io.ply import load_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import write_gif, write_video
-from gausim.ops.orbit import orbit_cameras
 from gausim.pictures.figures import error_figure, picture_grid
 from gausim.pictures.frames import PANEL_HEIGHT, brighten, comparison, contact_sheet, label_bar
 from gausim.render.draw import film, to_bytes
 from gausim.report.verdict import first_sentences
-
-# Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].
-FRAMES, SWAY = 120, 0.02
-SIZE = (480, 480)
 
 
 def simulate_run(arguments: argparse.Namespace) -> int:
@@ -139,42 +132,6 @@ def _simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -
     _list(folder, arguments)
     replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
     end(_sentences(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
-    return 0
-
-
-def simulate_scene(arguments: argparse.Namespace) -> int:
-    """Simulates a scene without a run; writes trajectory, session, video and pictures; returns the exit status.
-
-    Without forces the scene begins with a sway along x.
-
-    Raises:
-        ConfigError: an option is missing or wrong.
-        SceneError: the scene is unusable, or nothing of it is pinned.
-        DivergenceError: a simulated position is not finite.
-    """
-    if arguments.base is None:
-        raise ConfigError("--scene: its motion needs a trained network, --from RUN (a run of model=gausim).")
-    if arguments.session:
-        raise ConfigError("--session replays what was done to a run's object. With --scene give --force and the like.")
-    scene = pinned_by(load_scene(arguments.scene), arguments.sides)
-    interaction = opened_scene(
-        scene, arguments, sway=0.0 if has_forces(arguments) else SWAY, gravity=STANDARD_GRAVITY * arguments.metre,
-        most_force=arguments.most_force,
-    )  # fmt: skip
-    session, arrows = _new_session(interaction, arguments, arguments.frames or FRAMES), list[list[Arrow]]()
-    trajectory = replay(interaction, session, watch=lambda live: arrows.append(arrows_of(live)))
-    folder = arguments.out or Path(f"{arguments.scene.stem}_simulation")
-    save_trajectory(
-        folder / "trajectory.safetensors", trajectory, facts={"object": scene.name, "run": arguments.base.name}
-    )
-    save_session(session, folder / "session.json")
-    cameras = orbit_cameras(
-        scene.means[scene.foreground], azimuths=[arguments.azimuth], up=arguments.up, size=SIZE
-    )  # fmt: skip
-    renderer = instantiate(compose(["render=auto"]).render)
-    _write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
-    _list(folder, arguments)
-    end(_sentences(interaction, trajectory), "videos", folder)
     return 0
 
 

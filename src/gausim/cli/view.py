@@ -15,7 +15,6 @@ from gausim.cli.arguments import (
     add_device_options,
     add_names,
     add_pin_option,
-    add_scene_options,
     command_parser,
     computing,
 )
@@ -72,8 +71,21 @@ def _parser() -> argparse.ArgumentParser:
     add("--name", action="append", default=[], metavar="HOST", help="answer to this host name, too")
     add("--seconds", type=int, metavar="N", help="stop after so many seconds (default: when interrupted)")
     add_device_options(parser)
-    add_pin_option(add_scene_options(parser))
+    add_pin_option(_scene_options(parser))
     return parser
+
+
+def _scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    group = parser.add_argument_group("a scene without a run")
+    add = group.add_argument
+    add("--from", dest="base", metavar="RUN", type=Path, help="move the scene by the network of this run")
+    add("--stiffness", type=float, metavar="S",
+        help="let the slowest swing take S^(-1/2) seconds (default with --from: 1)")  # fmt: skip
+    add("--damping", type=float, metavar="D",
+        help="let amplitudes fall as exp(-D t / 2) [1 / s] (default with --from: 0.5)")  # fmt: skip
+    add("--fps", type=float, default=30.0, help="simulate so many frames per second (default: 30)")
+    add("--seed", type=int, default=0, help="draw the weights of an untrained model with this seed (default: 0)")
+    return group
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:

@@ -7,11 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gausim.cli.arguments import opened_scene, pinned_by
+from gausim.cli.arguments import pinned_by
 from gausim.compose.build import load_run
 from gausim.compose.data_paths import data_option
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import run_object, state_of
+from gausim.compose.unfilmed import open_scene
 from gausim.io.ply import load_scene
 from gausim.models.step.scene_model import SceneModel
 from gausim.viewer.shown import Take
@@ -41,10 +42,11 @@ def run_subject(arguments: argparse.Namespace) -> Subject:
 def scene_subject(arguments: argparse.Namespace) -> Subject:
     """A scene without a run."""
     scene = pinned_by(load_scene(arguments.what), arguments.pin)
+    names = ("fps", "base", "seed", "stiffness", "damping", "gravity", "device")
     method = "untrained: template only" if arguments.base is None else f"network of {arguments.base}"
     return Subject(
         title=f"{scene.name}: {scene.count} kernels, {method}",
-        interaction=opened_scene(scene, arguments, gravity=arguments.gravity),
+        interaction=open_scene(scene, **{name: getattr(arguments, name) for name in names}),
         up=arguments.up,
         sessions=arguments.sessions or Path("sessions"),
     )

@@ -15,7 +15,7 @@ from gausim.compose.live import energy_ceiling
 from gausim.core import GaussianScene, SimState
 from gausim.core.errors import ConfigError
 from gausim.core.state import initial_sway
-from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.step.simulator import GausSim
@@ -39,7 +39,6 @@ def open_scene(
     seed: int = 0,
     sway: float = 0.0,
     gravity: float | None = None,
-    most_force: float | None = None,
     keep: int | None = 0,
     device: str = "cpu",
 ) -> Interaction:
@@ -49,8 +48,8 @@ def open_scene(
     this ``seed``. The material is the same everywhere: ``stiffness`` is over that of the material whose slowest swing
     takes one second (1), amplitudes fall as exp(-``damping`` t / 2) [1 / s] (0.5); without a base and both it is the
     reference material. ``sway`` is the initial displacement per frame of the kernel farthest from the pins [diagonals],
-    ``gravity`` the unit of weight [scene units / s^2] (9.81), ``most_force`` the largest force [weights], ``keep`` the
-    number of latest frames that are kept (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
+    ``gravity`` the unit of weight [scene units / s^2] (9.81), ``keep`` the number of latest frames that are kept
+    (None: all), ``device`` as for :func:`gausim.compose.device.find_device`.
 
     Raises:
         SceneError: no kernel is pinned.
@@ -77,7 +76,7 @@ def open_scene(
     return Interaction(
         scene, dynamics, dynamics.masses, initial, made_with=made_with, units=tuple(model.units_of_kernels(0)),
         gravity=STANDARD_GRAVITY if gravity is None else gravity,
-        most_force=MOST_FORCE if most_force is None else most_force, keep=keep,
+        keep=keep,
     )  # fmt: skip
 
 

@@ -34,10 +34,8 @@ def composite(
     return rgb, alpha
 
 
-def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:
+def read_rgba(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Decodes one 8-bit RGBA image of ``size`` = (width, height) to (H, W, 4).
-
-    ``opaque`` sets alpha to 255 everywhere; then RGB files are accepted, too.
 
     Raises:
         DataError: the file is missing, is not an image, or has another size or depth or no alpha.
@@ -53,8 +51,6 @@ def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.
     pixels = decode(path)
     if pixels is None:
         raise DataError(f"{path}: cannot be decoded as an image{_film_hint(path)}. Re-export the frame as PNG.")
-    if opaque and pixels.ndim == 3 and pixels.shape[-1] in (3, 4):
-        pixels = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2BGRA)
     expected = (size[1], size[0], 4)
     if pixels.shape != expected or pixels.dtype != np.uint8:
         channels = {2: "gray"}.get(pixels.ndim) or {3: "RGB", 4: "RGBA"}.get(pixels.shape[-1], "?")
@@ -93,13 +89,11 @@ def room_for(count: tuple[int, ...], cameras: Cameras, where: Path) -> UInt8[np.
         ) from error
 
 
-def read_rgba_into(
-    paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int], *, opaque: bool = False
-) -> None:
+def read_rgba_into(paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int]) -> None:
     """Decodes each path into the (H, W, 4) array of the same index, in parallel (see :func:`read_rgba`)."""
 
     def decode(item: tuple[Path, np.ndarray]) -> None:
-        item[1][...] = read_rgba(item[0], size, opaque=opaque)
+        item[1][...] = read_rgba(item[0], size)
 
     with ThreadPoolExecutor(DECODER_THREADS) as pool:
         for _ in pool.map(decode, zip(paths, targets, strict=True)):

@@ -41,10 +41,8 @@ class Stills:
     heldout: tuple[int, ...]
 
 
-def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = False) -> Stills:
+def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT) -> Stills:
     """Reads all images named by a ``transforms.json`` of the rest scene; one in ``every`` is held out of training.
-
-    ``opaque`` ignores alpha and uses whole images; then images without alpha are accepted, too.
 
     Raises:
         DataError: an image or pose is unusable.
@@ -52,7 +50,7 @@ def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = F
     posed = read_transforms(path)
     cameras = posed.cameras
     images = room_for((len(posed.frames),), cameras, path)
-    read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height), opaque=opaque)
+    read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height))
     heldout = tuple(range(every - 1, len(images), every))
     train = tuple(sorted(set(range(len(images))) - set(heldout)))
     return Stills(torch.from_numpy(images), cameras, train, heldout)

@@ -20,8 +20,7 @@ _HELP = {
     "impulse": "on=PART weight_seconds=J direction=D [at=FRAME]: the speed that weight gives in J seconds, at once",
     "wind": "weights=W direction=D [gusts=0..1] [at=FRAME]: on all kernels by their cross-section, until the next",
     "gravity": "weights=W direction=D [at=FRAME]: besides that of the recording, until the next",
-    "pin": "on=PART [at=FRAME]: hold it where it is; or, of a --scene, SIDE: pin what is on a side from the beginning "
-    'on, e.g. "below z=0.33"',
+    "pin": "on=PART [at=FRAME]: hold it where it is",
     "unpin": "[on=PART] [at=FRAME]: let it go",
     "hand": "to=X,Y,Z [frames=N] [turn=X,Y,Z] [hand=H] [at=FRAME]: move the pins to a place relative to rest [scene "
     "units], turned by an axis times an angle [radian], within N frames",

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from numpy.lib.recfunctions import structured_to_unstructured
 from plyfile import PlyData, PlyListProperty, PlyParseError
-from torch import Tensor
 
 from gausim.core.errors import DataError, SceneError
 from gausim.core.outliers import outliers
@@ -106,21 +103,15 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     return scene
 
 
-def save_scene(
-    scene: GaussianScene, path: Path | str, *, masks: bool = True, more: Mapping[str, Float[Tensor, " K"]] | None = None
-) -> None:
-    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically.
-
-    ``more`` are further properties by name, after those of 3DGS.
-    """
-    path, more = Path(path), more or {}
+def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) -> None:
+    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
+    path = Path(path)
     rest_count = 3 * (scene.sh.shape[1] - 1)
-    names = [*_POSITION, "nx", "ny", "nz", *_COLOR, *(f"f_rest_{i}" for i in range(rest_count)), *_SHAPE, *more]
+    names = [*_POSITION, "nx", "ny", "nz", *_COLOR, *(f"f_rest_{i}" for i in range(rest_count)), *_SHAPE]
     # Channel-major: all coefficients of red, then of green, then of blue.
     rest = scene.sh[:, 1:].transpose(1, 2).reshape(scene.count, rest_count)
     normals = torch.zeros_like(scene.means)
     columns = [scene.means, normals, scene.sh[:, 0], rest, scene.opacity_logits[:, None], scene.log_scales, scene.quats]
-    columns += [values[:, None] for values in more.values()]
     body = torch.cat([c.detach().cpu().float() for c in columns], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {scene.count}"]
     header += [f"property float {n}" for n in names] + ["end_header", ""]

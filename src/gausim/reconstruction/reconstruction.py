@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +13,7 @@ from torch import Tensor
 from gausim.core import ConfigError, DivergenceError, GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.losses.image import ImageLoss
-from gausim.reconstruction.splat_start import PointCloud, Start, start_object, start_open
+from gausim.reconstruction.splat_start import PointCloud, start_object
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet
 
@@ -24,10 +23,10 @@ FINAL_RATE = 0.1
 SSIM_WINDOW = 11
 # Weights of D-SSIM against L1 (3DGS), of the L1 error of alpha against the mask, and of long kernels.
 SSIM_WEIGHT, ALPHA_WEIGHT, ANISOTROPY_WEIGHT = 0.2, 0.2, 0.02
-# Fraction of an object's kernels at the start; splitting adds the others. An open scene starts with all its points.
+# Fraction of the kernels at the start; splitting adds the others.
 START_FRACTION = 0.6
 # Number of times that kernels are pruned and split.
-ROUNDS = {"object": 8, "scene": 16}
+ROUNDS = 8
 # Margin of the structural loss around the masks' bounding box [pixels].
 CROP_MARGIN = 6
 # Steps between two limitations of the kernels' sizes.
@@ -49,8 +48,6 @@ class ReconstructionOptions:
 
     kernels: int = 2000  # target number of kernels (pruning may leave fewer)
     iterations: int = 4000  # optimiser steps, one image each
-    # ``object``: the foreground of the masks, within their visual hull; ``scene``: everything in the images
-    extent: Literal["object", "scene"] = "object"
     sh_degree: int = 1  # degree of the spherical harmonics, 0..3
     hull_resolution: int = 96  # voxels along the longest side of the visual hull
     missing_masks: float = 0.0  # fraction of the views whose masks may lack a part that all others show
@@ -78,8 +75,7 @@ class ReconstructionOptions:
     def round_steps(self) -> tuple[int, ...]:
         """Steps after which kernels are pruned and split: between 10 % and 70 % of the iterations."""
         first, last = 0.1 * self.iterations, 0.7 * self.iterations
-        rounds = ROUNDS[self.extent]
-        return tuple(sorted({int(first + (last - first) * i / (rounds - 1)) for i in range(rounds)}))
+        return tuple(sorted({int(first + (last - first) * i / (ROUNDS - 1)) for i in range(ROUNDS)}))
 
 
 def reconstruct(
@@ -93,14 +89,13 @@ def reconstruct(
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
-    Kernels of an object start on the surface of the visual hull of the first set (or on the points of ``cloud`` in
-    it), those of an open scene on the points. They are split where the images' error is largest and pruned where
-    they are transparent, never seen or out of bounds, because the dynamics moves every kernel. All are simulated
-    and foreground, none pinned. ``progress`` is called after every step.
+    Kernels start on the surface of the visual hull of the first set, or on the points of ``cloud`` in it. They are
+    split where the images' error is largest and pruned where they are transparent, never seen or out of bounds,
+    because the dynamics moves every kernel. All are simulated and foreground, none pinned. ``progress`` is called
+    after every step.
 
     Raises:
-        ConfigError: an open scene has no points.
-        DataError: no body projects into all masks, no points lie in it, or points of a scene have no colours.
+        DataError: no body projects into all masks, or no points lie in it.
         DivergenceError: the loss is not finite, or pruning left fewer than two kernels.
     """
     run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
@@ -131,7 +126,10 @@ class Reconstruction:
     ) -> None:
         """Places the first kernels (see :func:`reconstruct`)."""
         self._sets, self._renderer, self._options, self._name = list(sets), renderer, options, name
-        self._start = start = _start(sets[0], options, cloud, name)
+        self._start = start = start_object(
+            sets[0], round(START_FRACTION * options.kernels), resolution=options.hull_resolution,
+            missing=options.missing_masks, cloud=cloud, name=name,
+        )  # fmt: skip
         self.splats = Splats(
             start.points, start.colors, start.scales, sh_degree=options.sh_degree, opacity=0.8, rates=options.rates,
             extent=start.extent,
@@ -240,8 +238,7 @@ class Reconstruction:
 
     @torch.no_grad()
     def _limit(self) -> None:
-        largest = self._start.largest(self.splats["means"].detach())
-        self.splats["log_scales"].copy_(torch.minimum(self.splats["log_scales"], largest.log()[:, None]))
+        self.splats["log_scales"].clamp_max_(float(torch.tensor(self._start.largest).log()))
 
     def _prune(self) -> None:
         seen, lasting = self.splats.seen, self._lasting()
@@ -269,16 +266,6 @@ class Reconstruction:
             worse = 0.0 if mean < (1 - BETTER) * best else worse + 1
             total, count, best = 0.0, 0.0, min(best, mean)
         self._patience = [total, count, best, worse]
-
-
-def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud | None, name: str) -> Start:
-    if options.extent == "scene":
-        if cloud is None:
-            raise ConfigError(f"{name}: an open scene starts from points. Give those that `poses` found (points.npz).")
-        return start_open(images, cloud, name=name)
-    count = round(START_FRACTION * options.kernels)
-    resolution, missing = options.hull_resolution, options.missing_masks
-    return start_object(images, count, resolution=resolution, missing=missing, cloud=cloud, name=name)
 
 
 def _crop(mask: Bool[Tensor, "H W"]) -> tuple[slice, slice]:

@@ -1,4 +1,4 @@
-"""Initial Gaussians and their bounds: on the visual hull of the masks, or on the points of an open scene."""
+"""Initial Gaussians and their bounds: on the visual hull of the masks, or on points in it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,6 @@ NEIGHBOURS = 3
 MARGIN = 1
 # Largest standard deviation of an object's kernels [mean distances between neighbours at the start].
 OBJECT_CEILING = 1.5
-# Smallest standard deviation at the start of an open scene [mean distances of the cameras].
-SMALLEST = 1e-4
-# Largest standard deviation of a kernel of an open scene [distances to the nearest camera].
-OPEN_CEILING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +30,7 @@ class PointCloud:
     """Points at which kernels start."""
 
     points: Float[Tensor, "P 3"]  # positions [scene units]
-    colors: Float[Tensor, "P 3"] | None = None  # RGB in [0, 1]; None reads the colours of an object from the images
+    colors: Float[Tensor, "P 3"] | None = None  # RGB in [0, 1]; None reads them from the images
 
     def __post_init__(self) -> None:
         """Checks the numbers, or raises :class:`DataError`."""
@@ -53,7 +49,7 @@ class Start:
     colors: Float[Tensor, "K 3"]  # RGB in [0, 1]
     scales: Float[Tensor, " K"]  # standard deviations [scene units]
     contains: Callable[[Tensor], Tensor]  # mask of the points (N, 3) that are within bounds
-    largest: Callable[[Tensor], Tensor]  # largest standard deviation at points (N, 3) [scene units]
+    largest: float  # largest standard deviation [scene units]
     extent: float  # unit of the positions' learning rate [scene units]
 
 
@@ -93,29 +89,7 @@ def start_object(
     distance = neighbour_distance(points)
     chosen = _surface_colors(points, normals, images) if colors is None else colors[index]
     scales, ceiling = 0.6 * distance.clamp_min(1e-3 * hull.spacing), OBJECT_CEILING * float(distance.mean())
-    return Start(points, chosen, scales, room.contains, lambda at: torch.full_like(at[:, 0], ceiling), hull.diagonal)
-
-
-def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
-    """Balls on all points of an open scene, as large as the distances to their neighbours.
-
-    Kernels stay too small to reach a camera, where they would fill the image. Colours come from the points. They cannot
-    be read from the images, where a point may be occluded, and kernels that start with the colour of another surface
-    become fog.
-
-    Raises:
-        DataError: the points have no colours.
-    """
-    if cloud.colors is None:
-        raise DataError(f"{name}: points of an open scene need colours. Take the points.npz that `poses` wrote.")
-    centers, points = images.cameras.centers, cloud.points.float()
-
-    def largest(at: Tensor) -> Tensor:
-        return OPEN_CEILING * torch.cdist(at, centers).amin(-1)
-
-    extent = float((centers - points.median(0).values).norm(dim=-1).mean())
-    scales = torch.minimum(neighbour_distance(points).clamp_min(SMALLEST * extent), largest(points))
-    return Start(points, cloud.colors, scales, lambda at: torch.isfinite(at).all(-1), largest, extent)
+    return Start(points, chosen, scales, room.contains, ceiling, hull.diagonal)
 
 
 def neighbour_distance(points: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:

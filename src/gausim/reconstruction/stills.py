@@ -50,19 +50,18 @@ def gather_stills(
     path: Path,
     *,
     every: int = STILLS_PER_HELDOUT,
-    opaque: bool = False,
     longest: int | None = None,
     coarse: float = 0.0,
 ) -> Material:
     """The stills of the ``transforms.json`` at ``path``; one in ``every`` is not used in training but only measured.
 
-    ``opaque``: every pixel is foreground, whatever its alpha. Larger stills are reduced to ``longest`` [pixels].
-    ``coarse`` is the fraction of the steps, from the first, on stills of half that size, which cost a quarter.
+    Larger stills are reduced to ``longest`` [pixels]. ``coarse`` is the fraction of the steps, from the first, on
+    stills of half that size, which cost a quarter.
 
     Raises:
         DataError: fewer than two stills, or an image or pose is unusable.
     """
-    stills = read_stills(path, every=every, opaque=opaque)
+    stills = read_stills(path, every=every)
     if len(stills.images) < 2:
         raise DataError(f"{path}: {len(stills.images)} stills; expected at least two views of the object.")
     train, left_out = _split(stills, "stills to train on")
