@@ -5,8 +5,6 @@ diffusion prior, as the method's name states. The field models no dynamics: ever
 after the trained frames the motion repeats from frame 0, as in the original.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Unpack, cast
 

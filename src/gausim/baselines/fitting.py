@@ -1,7 +1,5 @@
 """Fits of a method to its sequences, stage by stage: a plain loop with checkpoints."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -5,8 +5,6 @@ linear elasticity in few modes, fitted by least squares. A method that predicts 
 frames are the state of an elastic body of which the modes show everything; four remember what they do not show.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Predictions without dynamics, from which every table counts: at rest, in rigid flight, and following hands."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Stages of a fit, as data: learning rates, numbers of frames and losses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """`gausim evaluate RUN`: measures a trained run on seen, unseen and held-out frames."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `gausim evaluate RUN` does: the development and the test part of the data, tables, figures, long rollouts."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The `gausim` command: imports only the chosen sub-command, so that `gausim --help` is fast."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import io

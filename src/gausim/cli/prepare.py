@@ -1,7 +1,5 @@
 """`gausim prepare WHAT`: makes data sets from films or photos or synthetically, and fetches LPIPS weights."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

@@ -1,7 +1,5 @@
 """`gausim simulate RUN`: videos, space-time slices, error plots and trajectories of a run's predictions."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `gausim simulate` does: predictions beside the truth, and objects under forces."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Iterator

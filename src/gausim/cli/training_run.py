@@ -1,7 +1,5 @@
 """Training as `gausim train` and `gausim adapt` do it: a run or a job of a sweep, its evaluation, and its result."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`gausim verify`: lists all faults of a data set."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Content of the viewer for a run or a bare scene: interactions, predictions, cameras."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks that the chosen ablations act on the configuration, by composing it with and without them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Builds training modules from configurations, and loads trained modules from run directories."""
 
-from __future__ import annotations
-
 import copy
 import logging
 from collections.abc import Mapping

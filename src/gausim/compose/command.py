@@ -1,7 +1,5 @@
 """The command line of `gausim train`: a job or a sweep under Hydra, after checks that need no data."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Composition of configurations of conf/, and construction of objects from them."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Mapping, Sequence
 from functools import partial

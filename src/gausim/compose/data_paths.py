@@ -1,7 +1,5 @@
 """Paths of a run's data on this machine, by its configuration and its replacements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

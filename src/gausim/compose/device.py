@@ -1,7 +1,5 @@
 """Choice of the device that a command computes on."""
 
-from __future__ import annotations
-
 import re
 
 import torch

@@ -1,7 +1,5 @@
 """Errors of Hydra and OmegaConf as one sentence each, with the nearest known key or choice."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Collection, Iterator, Sequence

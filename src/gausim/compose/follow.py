@@ -1,7 +1,5 @@
 """Program of the ranks that the first one starts: `python -m gausim.compose.follow RUN_DIRECTORY`."""
 
-from __future__ import annotations
-
 import sys
 
 from gausim.compose.build import opened

@@ -1,7 +1,5 @@
 """Interactive objects of runs, for `simulate`, `view` and the Python interface."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a page that simulates an object needs, from a trained run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, cast
 

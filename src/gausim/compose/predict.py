@@ -1,7 +1,5 @@
 """Objects of a trained run and predictions of their sequences."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from typing import Any

@@ -3,8 +3,6 @@
 This module does not load torch, so that shell completion is fast.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

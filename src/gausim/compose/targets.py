@@ -1,7 +1,5 @@
 """Allow-list of the targets of configurations, which may come from others and must not call arbitrary code."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any

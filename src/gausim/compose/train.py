@@ -1,7 +1,5 @@
 """Training of a run: from a configuration to a finished directory."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from typing import Any, cast

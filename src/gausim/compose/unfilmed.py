@@ -1,7 +1,5 @@
 """A scene without videos: moved by the network of a trained run and a chosen material, or by the template alone."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, cast

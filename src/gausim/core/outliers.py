@@ -1,7 +1,5 @@
 """Kernels of a scene that are most likely wrong: far outside of the body, or larger than it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

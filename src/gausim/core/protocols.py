@@ -1,7 +1,5 @@
 """Interfaces of methods of dynamics, for whole rollouts and frame by frame, and of renderers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """A corpus of elastic bodies with known motion and material: safetensors shards beside a ``manifest.json``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

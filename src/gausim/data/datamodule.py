@@ -1,7 +1,5 @@
 """The LightningDataModule over READY-like object directories."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path

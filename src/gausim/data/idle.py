@@ -1,7 +1,5 @@
 """Sequences that teach nothing: black, empty, or one picture repeated."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decoding and checking of RGBA image files, and compositing of straight alpha."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """One object of a data set: metadata, sequences, stills, true points and rest scene in one directory; its test part."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property

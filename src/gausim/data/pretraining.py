@@ -1,7 +1,5 @@
 """The LightningDataModule over a corpus of bodies with known motion and material (:mod:`gausim.data.corpus`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial

@@ -1,7 +1,5 @@
 """Records of a data set on disk: sequences, true motion and stills. Frames are read on request."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Surroundings of an object as its data set states them: ``dataset.json`` and ``hands.npz``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """Finds all faults of a data set on disk, not only the first that would stop a training."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of appearance: constant exposure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

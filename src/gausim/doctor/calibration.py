@@ -1,7 +1,5 @@
 """Check of calibration: agreement of the rest scene with frame 0 in every camera, and common misreadings of files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Check of synchronisation: whether the cameras show the same motion in the same frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

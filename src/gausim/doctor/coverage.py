@@ -1,7 +1,5 @@
 """Checks of coverage: pins, number of frames and sequences, framing and directions of the cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Input of the checks, some reduced frames of some sequences and the rest scene in every camera, and their findings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal

@@ -1,7 +1,5 @@
 """Checks of masks: inverted, missing, empty, flickering, or with haze around the object."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

@@ -1,7 +1,5 @@
 """Checks of motion: its size, its frequency relative to the frame rate, and its start at rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

@@ -1,7 +1,5 @@
 """Pictures of the examined data: views with the scene's outline, and motion over time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Silhouettes of the rest scene, and their alignment with the masks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

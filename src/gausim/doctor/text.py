@@ -1,7 +1,5 @@
 """Output of findings: text and plain data."""
 
-from __future__ import annotations
-
 import textwrap
 from dataclasses import asdict
 from typing import Any

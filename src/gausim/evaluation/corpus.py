@@ -1,7 +1,5 @@
 """Figures of bodies of a corpus: the motion predicted for them, and the material fitted to them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

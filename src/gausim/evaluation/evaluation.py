@@ -5,8 +5,6 @@ It needs no run: any callable that returns a :class:`Trajectory` of a sequence c
 kept.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

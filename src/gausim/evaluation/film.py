@@ -1,7 +1,5 @@
 """The film of an evaluation: truth, prediction and error of one sequence side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

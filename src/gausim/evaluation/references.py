@@ -1,7 +1,5 @@
 """Reference of an object: what a prediction without dynamics gives, from which every table counts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

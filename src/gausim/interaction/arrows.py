@@ -1,7 +1,5 @@
 """Arrows for forces, in the scene and drawn into pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

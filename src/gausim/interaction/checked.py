@@ -1,7 +1,5 @@
 """Records whose fields are validated against their annotations at construction, from files or from Python."""
 
-from __future__ import annotations
-
 from functools import cache
 from types import UnionType
 from typing import Annotated, Any, get_type_hints

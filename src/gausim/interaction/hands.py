@@ -1,7 +1,5 @@
 """Hands that move the pins of an object: as recorded, until a user takes them over."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import torch

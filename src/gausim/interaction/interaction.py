@@ -1,7 +1,5 @@
 """Interactive simulation: forces, wind, gravity and pins on an object, step by step, recorded as a session."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections import deque

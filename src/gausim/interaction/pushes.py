@@ -1,7 +1,5 @@
 """Forces as accelerations of kernels, the terms of an interaction's sum."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Replay of a recorded force session."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

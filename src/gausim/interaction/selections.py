@@ -1,7 +1,5 @@
 """Selections that events act on: a unit of the hierarchy, listed kernels, a ball, or the whole object."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from itertools import groupby

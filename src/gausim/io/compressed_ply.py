@@ -1,7 +1,5 @@
 """Compressed PLY of SuperSplat and PlayCanvas: 256 Gaussians share a chunk with the bounds of their packed values."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, UInt32
 from numpy.lib.recfunctions import structured_to_unstructured

@@ -1,7 +1,5 @@
 """Archives of numpy arrays, read without pickles and with a bound on their size."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Of each view only the bounding box of its foreground over all frames is stored, 
 Pixels outside are transparent. Frames are read on request without decoding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A trained template in one HTML page that simulates it: WebGL 2, no library, no network."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Strict JSON: no NaN, no infinity, no numbers beyond 64 bits, limited nesting."""
 
-from __future__ import annotations
-
 import codecs
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A motion in one HTML page that plays it: WebGL 2, no library, no network."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json

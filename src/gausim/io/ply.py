@@ -4,8 +4,6 @@ The PLY is a standard 3DGS file that every viewer reads; the masks and the volum
 needs, are in ``<stem>.masks.npz`` next to it.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 from dataclasses import replace

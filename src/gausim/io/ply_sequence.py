@@ -1,7 +1,5 @@
 """A motion as numbered PLY files, name_0001.ply, name_0002.ply, ..., the format of SuperSplat's timeline."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

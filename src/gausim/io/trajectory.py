@@ -1,7 +1,5 @@
 """Trajectories as safetensors files: bit-exact, and without executable content."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reader and writer of nerfstudio/Blender ``transforms.json``: posed images, camera to world in OpenGL axes."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Collection

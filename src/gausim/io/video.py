@@ -1,7 +1,5 @@
 """Video files through PyAV (no system ffmpeg needed): MP4 for players, GIF for web pages, not for training."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Log messages while numba or Warp compiles, so that a first call of some seconds does not seem to hang."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator

@@ -10,8 +10,6 @@ vector instructions; the tuple of taps has its length in its type, so loops over
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls
-from __future__ import annotations
-
 import numba
 import numpy as np
 import torch

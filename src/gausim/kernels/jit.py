@@ -1,7 +1,5 @@
 """Options of numba for all compiled functions."""
 
-from __future__ import annotations
-
 import logging
 import os
 import tempfile

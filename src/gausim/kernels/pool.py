@@ -1,7 +1,5 @@
 """A small persistent pool of Python threads for compiled kernels, which release the GIL."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import os

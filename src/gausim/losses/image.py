@@ -1,7 +1,5 @@
 """The image loss lambda L2 + (1 - lambda) D-SSIM (METHOD section 4)."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

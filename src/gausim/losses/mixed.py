@@ -1,7 +1,5 @@
 """Mixtures of L1, squared error and SSIM, the image losses of other methods."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Objective of training: weights of the loss terms, lengths of backpropagation, and the static loss."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Image metrics: one value per image, averaged over images and ranks."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 The weights are not part of this package: `gausim prepare lpips` downloads and converts the published files.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Metrics of 3D motion: distance of points to the truth, by level too, motion energy, and the bounce of a fall."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Principal motions of displacements, the few orthogonal shapes with the largest square, and their spectrum."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

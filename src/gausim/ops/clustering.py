@@ -1,7 +1,5 @@
 """Clustering of kernels into units of bounded diameter (METHOD section 1), and k-means."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree

@@ -1,7 +1,5 @@
 """Covariances of Gaussians and their transport by deformations."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Deformation gradients: their construction from network outputs, bounds and rotations."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

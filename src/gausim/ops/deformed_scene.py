@@ -1,7 +1,5 @@
 """Export of one frame of a trajectory as a scene for any 3DGS viewer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

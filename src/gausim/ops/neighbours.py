@@ -5,8 +5,6 @@ radius, and of two points at the same distance the one with the lower index coun
 tree (:func:`batched_radius_edges`) and that by torch operations (:func:`neighbour_codes`) agree, ties included.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras on a circle around a scene."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Rotations, and the vectors and quaternions that describe them."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

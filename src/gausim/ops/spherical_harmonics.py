@@ -1,7 +1,5 @@
 """Real spherical harmonics of 3DGS files, degree 0 to 3."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Figures of results: errors over time, grids of pictures, long rollouts."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from itertools import cycle

@@ -1,7 +1,5 @@
 """Comparison of films of truth and prediction: videos side by side, sheets of single frames, error colours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import cv2

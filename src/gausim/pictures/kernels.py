@@ -1,7 +1,5 @@
 """Pictures of the kernels: units of every level of a hierarchy, and the colours of a scale."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

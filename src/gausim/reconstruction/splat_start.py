@@ -1,7 +1,5 @@
 """Initial Gaussians and their bounds: on the visual hull of the masks, or on points in it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Trainable Gaussians: raw 3DGS parameters with an Adam optimiser that survives splitting and pruning."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

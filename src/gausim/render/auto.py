@@ -1,7 +1,5 @@
 """Choice of the renderer by device: gsplat on CUDA, the compiled CPU renderer elsewhere."""
 
-from __future__ import annotations
-
 import functools
 import logging
 from typing import Any

@@ -1,7 +1,5 @@
 """The CUDA renderer: gsplat's kernels behind core.Renderer."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 from collections.abc import Callable

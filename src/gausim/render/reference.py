@@ -1,7 +1,5 @@
 """The reference renderer: Gaussian splatting in plain torch, any floating type, differentiated by autograd."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor

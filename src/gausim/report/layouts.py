@@ -1,7 +1,5 @@
 """The tables of a report and of pages: which figures of the long table are their columns."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

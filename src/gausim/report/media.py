@@ -1,7 +1,5 @@
 """Pictures of a report, as data URIs: error curves and the films of evaluations."""
 
-from __future__ import annotations
-
 import base64
 import io
 

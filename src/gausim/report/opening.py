@@ -1,7 +1,5 @@
 """First screens of a report: per run a film and a sentence."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass
 from itertools import zip_longest

@@ -1,7 +1,5 @@
 """Figures of the GausSim paper as reference rows, measured on its recordings and cameras."""
 
-from __future__ import annotations
-
 import re
 
 Pair = tuple[float, float]

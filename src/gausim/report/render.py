@@ -1,7 +1,5 @@
 """Tables as Markdown and LaTeX."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

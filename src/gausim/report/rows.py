@@ -1,7 +1,5 @@
 """Rows of a report: runs of one configuration, whatever their seeds and objects, named after model and ablation."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Sequence

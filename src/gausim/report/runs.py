@@ -1,7 +1,5 @@
 """Search for run directories, and their configuration, state and summary, which are read as untrusted data."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Data of a report: groups of runs as rows of its tables, and one long table of all their figures."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

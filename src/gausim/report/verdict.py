@@ -1,7 +1,5 @@
 """One sentence on a method's predictions of an object, and the order of runs."""
 
-from __future__ import annotations
-
 import math
 
 from gausim.results.curves import ERROR_3D

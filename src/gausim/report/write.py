@@ -1,7 +1,5 @@
 """Writer of reports: from directories of runs to HTML, Markdown, LaTeX and CSV files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

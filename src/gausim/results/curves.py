@@ -6,8 +6,6 @@ sequences, frames and views (training views first), ``error_3d``, ``track_error`
 ``truth``, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pivot of the long table: columns say which figures, rows are those that have any; and its Markdown."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

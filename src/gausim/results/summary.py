@@ -1,7 +1,5 @@
 """Summary of the per-frame figures of an object: entries of the long table, and facts."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence

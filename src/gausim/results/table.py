@@ -18,8 +18,6 @@ Values are in the metric's unit. ``split`` is a range of frames (``seen``, ``uns
 ``points`` (3D) or empty. ``deviation`` is over sequences. ``KEY_ratio`` is a value over the reference's.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Iterable

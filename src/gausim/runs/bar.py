@@ -1,7 +1,5 @@
 """A progress bar around the items of a loop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Checkpoints: written atomically, read without executing code, and checked against their scenes."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import pickle

@@ -1,7 +1,5 @@
 """Comparison of the configurations of two runs, key by key."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cost of training and prediction in seconds and peak memory, and the memory that the process keeps."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import statistics

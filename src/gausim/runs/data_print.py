@@ -1,7 +1,5 @@
 """Fingerprints of the sequences that a run is trained on, and what has changed of them since."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

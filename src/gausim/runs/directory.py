@@ -1,7 +1,5 @@
 """Run directories: configuration, progress, and whether a run is finished or can be resumed."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

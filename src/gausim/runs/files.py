@@ -1,7 +1,5 @@
 """Locks of run directories, and messages for errors of the disk."""
 
-from __future__ import annotations
-
 import errno
 import os
 import warnings

@@ -1,7 +1,5 @@
 """Provenance of results: commit of this package and hashes of the data, stored with every evaluation."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -4,8 +4,6 @@ gausim itself draws from private generators seeded by the run's seed and the ste
 draw from the global generators, whose state a resumed run must therefore restore.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager

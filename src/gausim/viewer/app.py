@@ -1,7 +1,5 @@
 """The viewer: a simulation, its page and the concurrent stages between them."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

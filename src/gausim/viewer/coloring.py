@@ -1,7 +1,5 @@
 """Colour modes of the kernels: appearance, hierarchy, strain, speed, mass or the learned material."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The simulation thread: commands from the page, playback, the timeline and replayed sessions."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

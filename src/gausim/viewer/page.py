@@ -1,7 +1,5 @@
 """The control panel of the page."""
 
-from __future__ import annotations
-
 import html
 import time
 from collections.abc import Callable

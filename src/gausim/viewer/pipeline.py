@@ -1,7 +1,5 @@
 """Concurrent stages: each processes its newest input in a separate thread and drops older inputs."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Pointer input from the browser: selecting parts by click or rectangle, and forces by dragging."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

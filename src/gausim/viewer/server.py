@@ -1,7 +1,5 @@
 """A viser server with access control."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import socket

@@ -1,7 +1,5 @@
 """Particles that represent a scene in the simulation, and the kernels that follow them (PhysDreamer, PhysGaussian)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

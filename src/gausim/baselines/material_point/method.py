@@ -6,8 +6,6 @@ waves in sides per second: periods scale with side sqrt(rho / E), and a factor c
 in PhysDreamer (side 1 / 1.8, rho 2000) corresponds to 0.324 E in PhysGaussian (side 1, rho 200).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

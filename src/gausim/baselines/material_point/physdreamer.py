@@ -4,8 +4,6 @@ The original is fitted to videos that a diffusion model generates; here it is fi
 fitted parameters are a velocity field per sequence and a field of Young's modulus per object.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Unpack, cast

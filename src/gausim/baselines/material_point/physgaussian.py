@@ -5,8 +5,6 @@ comes from the configuration. The original has no initial velocity of a recorded
 sequence is fitted to its first frames, or zero.
 """
 
-from __future__ import annotations
-
 from typing import Unpack
 
 import torch

@@ -1,7 +1,5 @@
 """Options of a simulation: material, grid, and time step with its bound."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Particles for the interior of an object, whose kernels lie on its surface (PhysGaussian, Xie et al., CVPR 2024)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The material point method, frame by frame: each is a differentiable function of torch."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Substeps and their adjoint as Warp launches on the caller's arrays; Warp is imported when they are first needed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any

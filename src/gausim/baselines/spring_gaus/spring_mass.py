@@ -5,8 +5,6 @@ velocity per anchor and sequence and, per object, a stiffness per anchor, an att
 All sequences of an object have the same object parameters; the original has one sequence per object.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Unpack

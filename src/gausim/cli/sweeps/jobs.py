@@ -1,7 +1,5 @@
 """Jobs of a sweep: handling of existing runs, launching, and the summary."""
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Fast form of :func:`gausim.render.draw.deformed_appearance`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One call of the renderer: B states in V views, divided into tasks for the pool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial

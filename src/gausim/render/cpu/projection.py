@@ -2,8 +2,6 @@
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls
-from __future__ import annotations
-
 import math
 
 import numba

@@ -8,8 +8,6 @@ and binning.py.
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -1,7 +1,5 @@
 """The CPU renderer as a differentiable operation of torch."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
