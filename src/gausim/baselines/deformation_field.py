@@ -20,19 +20,14 @@ from gausim.ops.rotation import quaternion_to_matrix
 
 
 class Field(nn.Module):
-    """Offsets of position, logarithmic scales and quaternion at points of space and time; all zero at first.
-
-    Attributes:
-        planes: features.
-        trunk: the layer before the heads.
-        heads: layers for the offsets of position, scales and quaternion.
-    """
+    """Offsets of position, logarithmic scales and quaternion at points of space and time; all zero at first."""
 
     def __init__(self, resolution: Sequence[int], features: int, hidden: int) -> None:
         """Draws its parameters from the global generator."""
         super().__init__()
-        self.planes = Planes(resolution, features)
-        self.trunk = nn.Linear(features, hidden)
+        self.planes = Planes(resolution, features)  # features
+        self.trunk = nn.Linear(features, hidden)  # the layer before the heads
+        # Layers for the offsets of position, scales and quaternion.
         self.heads = nn.ModuleList(_head(hidden, size) for size in (3, 3, 4))
 
     def forward(self, points: Float[Tensor, "P 4"]) -> tuple[Tensor, Tensor, Tensor]:

@@ -25,52 +25,33 @@ LONGEST_FOLDER_NAME = 120
 
 @dataclass
 class RootConfig:
-    """Schema of the root keys of a training configuration: a misspelt root key is an error.
+    """Schema of the root keys of a training configuration: a misspelt root key is an error."""
 
-    Attributes:
-        data: the data module: which set, views, frames and batches.
-        model: the dynamics.
-        loss: the terms and their weights; null for a method that is fitted in stages.
-        optimizer: the optimiser and its rates; null for a method that is fitted in stages.
-        plan: epochs, predicted frames, schedule, warm start and end.
-        supervision: reference of the predictions: images, true points or motion tracks.
-        render: the renderer.
-        trainer: devices, threads, checkpoints and display.
-        logger: loggers by name.
-        ablation: record of the chosen ablation.
-        seed: seed of every random generator.
-        name: name of the run, by default that of the data; its directory is `${output_root}/${name}/seed_${seed}`.
-        output_root: directory of all runs; a relative path starts at the directory of the command.
-        init_from: run from which the network and its input statistics are copied; null: random initialisation.
-        freeze: `network` freezes that network, so that only parameters of scenes are trained; `model` copies the whole
-            simulator of that run and freezes it, so that only initial states are trained.
-        doctor: whether the findings of `gausim doctor` are printed before training (not in sweeps).
-        evaluate: whether the run is evaluated after training (`gausim evaluate`), for reports.
-        trials: trials that were made of the method on the development part, declared in every table of the test part.
-        overwrite: remove an existing run in the directory.
-        retry_failed: in a sweep, resume runs that ended with an error; otherwise they are skipped.
-    """
-
-    data: Any = MISSING
-    model: Any = MISSING
-    loss: Any = None
-    optimizer: Any = None
-    plan: Any = MISSING
-    supervision: Any = None
-    render: Any = MISSING
-    trainer: Any = MISSING
-    logger: Any = None
-    ablation: Any = None
-    seed: int = 0
+    data: Any = MISSING  # the data module: which set, views, frames and batches
+    model: Any = MISSING  # the dynamics
+    loss: Any = None  # the terms and their weights; null for a method that is fitted in stages
+    optimizer: Any = None  # the optimiser and its rates; null for a method that is fitted in stages
+    plan: Any = MISSING  # epochs, predicted frames, schedule, warm start and end
+    supervision: Any = None  # reference of the predictions: images, true points or motion tracks
+    render: Any = MISSING  # the renderer
+    trainer: Any = MISSING  # devices, threads, checkpoints and display
+    logger: Any = None  # loggers by name
+    ablation: Any = None  # record of the chosen ablation
+    seed: int = 0  # seed of every random generator
+    # Name of the run, by default that of the data; its directory is `${output_root}/${name}/seed_${seed}`.
     name: str = MISSING
-    output_root: str = "outputs"
+    output_root: str = "outputs"  # directory of all runs; a relative path starts at the directory of the command
+    # Run from which the network and its input statistics are copied; null: random initialisation.
     init_from: str | None = None
+    # `network` freezes that network, so that only parameters of scenes are trained; `model` copies the whole simulator
+    # of that run and freezes it, so that only initial states are trained.
     freeze: str | None = None
-    doctor: bool = True
-    evaluate: bool = False
+    doctor: bool = True  # whether the findings of `gausim doctor` are printed before training (not in sweeps)
+    evaluate: bool = False  # whether the run is evaluated after training (`gausim evaluate`), for reports
+    # Trials that were made of the method on the development part, declared in every table of the test part.
     trials: int | None = None
-    overwrite: bool = False
-    retry_failed: bool = False
+    overwrite: bool = False  # remove an existing run in the directory
+    retry_failed: bool = False  # in a sweep, resume runs that ended with an error; otherwise they are skipped
 
 
 def folder_name(text: str, name: str = "") -> str:

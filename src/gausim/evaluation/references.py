@@ -24,15 +24,12 @@ class Reference:
     * ``ballistic``, of a free body whose motion is known: seen frames are the rigid flight from the true frames 0 and 1
       on, unseen ones that from the last two seen frames on (:func:`gausim.baselines.references.ballistic_motion`).
     * ``static``, of all others: the rest state.
-
-    Attributes:
-        name: its row in tables.
     """
 
     def __init__(self, data: ObjectData, scene: GaussianScene) -> None:
         """Chooses the reference of an object; ``scene`` is its rest scene."""
         self._scene, self._fps, self._seen = scene, data.fps, data.train_frames.stop
-        self.name = STATIC
+        self.name = STATIC  # its row in tables
         if any(record.hands is not None for record in data.sequences):
             self.name = FOLLOW_HANDS
         elif data.surroundings.free:

@@ -34,14 +34,6 @@ class _Painted:
 class Viewer:
     """Server of one :class:`Subject`.
 
-    Attributes:
-        server: the viser server.
-        live: the simulation thread.
-        pointer: selections and drags.
-        page: the control panel.
-        eye: position of the camera that moved last [page units].
-        workers: the stages after the simulation.
-
     Raises:
         ConfigError: the access settings are unsafe or invalid, or the address cannot be bound.
     """
@@ -49,19 +41,22 @@ class Viewer:
     def __init__(self, subject: Subject, access: Access) -> None:
         """Starts to listen; :meth:`start` begins the simulation."""
         scene = subject.interaction.scene
-        self.server = GuardedServer(access, label="gausim")
+        self.server = GuardedServer(access, label="gausim")  # the viser server
         self.placing = Placing.of(scene)
         self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
-        self.workers = (Worker("paint", self._paint), Worker("send", self._send))
+        self.workers = (Worker("paint", self._paint), Worker("send", self._send))  # the stages after the simulation
+        # The simulation thread.
         self.live = Live(
             subject.interaction, self.workers[0].put, takes=subject.takes,
             watched=lambda: bool(self.server.get_clients()),
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
         self.server.scene.world_axes.visible = False
-        self.pointer = Pointer(self.server, self.live, self.placing)
+        self.pointer = Pointer(self.server, self.live, self.placing)  # selections and drags
+        # The control panel.
         self.page = Page(self.server, self.live, self.pointer, subject, self._painter, self.repaint)
         self.camera_panel = CameraPanel(self.server, self.placing, subject)
+        # Position of the camera that moved last [page units].
         self.eye = torch.tensor(self.camera_panel.first_position, dtype=torch.float32)
         self._viewed, self._sent = 0.0, Rate()
         self._splats = add_splats(self.server.scene, "/splats", self._paint_now(self.live.shown()).buffer)

@@ -42,18 +42,14 @@ LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
 
 
 class TriPlaneField(nn.Module):
-    """A smooth function of space: summed features of three planes, a hidden layer, ``outputs`` numbers, 0 at first.
-
-    Attributes:
-        planes: the features, ``resolution`` numbers along both axes of each.
-        network: maps the features to the outputs.
-    """
+    """A smooth function of space: summed features of three planes, a hidden layer, ``outputs`` numbers, 0 at first."""
 
     def __init__(self, resolution: int, *, features: int = 32, hidden: int = 32, outputs: int = 1) -> None:
         """Draws its parameters from the global generator."""
         super().__init__()
+        # The features, ``resolution`` numbers along both axes of each.
         self.planes = Planes([resolution] * 3, features, combine=SUM)
-        self.network = mlp([features, hidden, outputs], "relu")
+        self.network = mlp([features, hidden, outputs], "relu")  # maps the features to the outputs
         zero_output(self.network)
 
     def forward(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P outputs"]:
