@@ -1,7 +1,5 @@
 """Trainable initial states: x_{-1} of every training sequence (METHOD section 4), and x_0 of free bodies."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import cast

@@ -1,7 +1,5 @@
 """Settings of a simulator's hierarchy and of its rollouts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Interface of a trainable simulator: steps over a disjoint graph of several sequences."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 

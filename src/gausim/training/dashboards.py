@@ -1,7 +1,5 @@
 """Media on the dashboards of Lightning's loggers."""
 
-from __future__ import annotations
-
 import io
 import tempfile
 from pathlib import Path

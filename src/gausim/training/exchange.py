@@ -1,7 +1,5 @@
 """Sums over ranks at the end of an optimiser step: loss gradients and input statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

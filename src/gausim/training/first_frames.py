@@ -1,7 +1,5 @@
 """Where free bodies are and how fast they move in their first frames, from silhouettes: the start of their training."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import torch

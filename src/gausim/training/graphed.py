@@ -1,7 +1,5 @@
 """Rollouts of optimiser steps as CUDA graphs: tens of thousands of CUDA kernels in two launches."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator
 from typing import Any, cast

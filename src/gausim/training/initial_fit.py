@@ -6,8 +6,6 @@ derivatives with respect to the amplitudes of z_{-1} are those of the template's
 fast the method converges, and not to what.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Parts of training that an optimiser step needs, without a trainer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, cast
 

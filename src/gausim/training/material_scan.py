@@ -1,7 +1,5 @@
 """The material of bodies of which some frames are known: a scan for its even part, then a fit by descent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import cast
 

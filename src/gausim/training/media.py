@@ -1,7 +1,5 @@
 """Media of training: a video and a picture of every shown sequence, as files of the run."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

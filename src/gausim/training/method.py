@@ -1,7 +1,5 @@
 """The trained method: one simulator of all scenes with an initial state of every sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, cast
 

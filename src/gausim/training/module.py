@@ -1,7 +1,5 @@
 """LightningModule of training: hooks around the optimiser step (:mod:`gausim.training.step`), metrics, checkpoints."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast

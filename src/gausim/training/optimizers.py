@@ -1,7 +1,5 @@
 """Settings of the optimiser: learning rates by parameter group, weight decay, clipping."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

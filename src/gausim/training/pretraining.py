@@ -1,7 +1,5 @@
 """Training on bodies whose motion, and where given whose material, is known."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import cast

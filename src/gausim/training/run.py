@@ -1,7 +1,5 @@
 """Training of a simulator: its beginning, what is printed of it, and the fit by Lightning."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """The stages before the first optimiser step: track, warm start, teach. The rollouts on images follow."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """One optimiser step: inputs, rollout, loss terms, backward passes, update."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

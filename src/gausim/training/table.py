@@ -1,7 +1,5 @@
 """CSV tables of resumable runs: no duplicate rows, none lost."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

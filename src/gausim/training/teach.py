@@ -14,8 +14,6 @@ motions of an elastic body add up, so a part of the lessons is on sums of two di
 the same body, with (a, b) anywhere in the unit disc.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """The first stage of a training: the motion of all sequences, from the images or from true points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast

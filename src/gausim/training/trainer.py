@@ -1,7 +1,5 @@
 """The Lightning trainer of a run."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Sequence

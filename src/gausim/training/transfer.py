@@ -1,7 +1,5 @@
 """Weights from another run: the network with its input statistics, or the whole simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Batches of sequences, of one or several scenes, as one disjoint graph, and the edges of its steps."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

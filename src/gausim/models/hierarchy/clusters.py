@@ -1,7 +1,5 @@
 """The hierarchy of kernels and centre-of-mass systems, with their parents and roots (METHOD section 1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Constants of the units of the predicted levels between two updates of the parameters (METHOD section 1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

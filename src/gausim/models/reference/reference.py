@@ -12,8 +12,6 @@ prediction y, G, Q of the kernels at t + 1 goes back to
     x_k = a_c + A_c (X_k - X_c) + B_c (y_k - X_k),   A_c + B_c (G_c - I),   B_c Q_c.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple

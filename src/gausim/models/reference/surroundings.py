@@ -1,7 +1,5 @@
 """Surroundings of the scenes: what is trained of them, and the references of a batch's bodies."""
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 from typing import cast

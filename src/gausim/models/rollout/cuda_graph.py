@@ -1,7 +1,5 @@
 """A step of one batch as a CUDA graph: thousands of CUDA kernels in one launch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

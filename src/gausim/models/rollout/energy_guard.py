@@ -1,7 +1,5 @@
 """Energy guard of rollouts: scales the network's correction down where it would add energy without a force."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import torch

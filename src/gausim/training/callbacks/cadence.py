@@ -1,7 +1,5 @@
 """Functions for callbacks: their epochs and the training data."""
 
-from __future__ import annotations
-
 from lightning.pytorch import Trainer
 
 from gausim.data.datamodule import ReadyDataModule

@@ -1,7 +1,5 @@
 """Motion errors during training, on seen and unseen frames."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any

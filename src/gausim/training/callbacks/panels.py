@@ -1,7 +1,5 @@
 """Media of training for dashboards: predictions of seen frames, every few epochs."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

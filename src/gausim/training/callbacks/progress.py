@@ -1,7 +1,5 @@
 """One line and one row per epoch, and the progress bar."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

@@ -1,7 +1,5 @@
 """Checkpoints of a run, with the state that Lightning leaves out."""
 
-from __future__ import annotations
-
 import hashlib
 import signal
 import threading

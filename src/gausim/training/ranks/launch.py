@@ -1,7 +1,5 @@
 """Ranks of a run: Lightning's strategy, and processes that follow the first one by the run directory."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

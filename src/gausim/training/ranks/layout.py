@@ -1,7 +1,5 @@
 """Number and placement of a run's ranks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

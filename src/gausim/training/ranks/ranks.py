@@ -4,8 +4,6 @@ Every rank has the whole model and computes a part of a step's sequences. Values
 divides its losses by the whole step's number of sequences, so the sums over ranks equal the step of a single rank.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Rendering of predicted states and their image loss, a few states at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Supervision of rollouts: the interface, and supervision by the images of the training views."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable

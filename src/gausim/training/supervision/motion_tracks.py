@@ -15,8 +15,6 @@ Rollouts are compared with the tracked kernels in 3D: every part of the object h
 or much, and nothing is rendered.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Penalty on the energy growth of free motion beyond the training frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any

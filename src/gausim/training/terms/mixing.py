@@ -1,7 +1,5 @@
 """Penalty on mode mixing: keeps a trained template near the body's modes where the frames do not determine it."""
 
-from __future__ import annotations
-
 from gausim.training.terms.term import StepInputs
 
 

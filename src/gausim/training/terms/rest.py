@@ -1,7 +1,5 @@
 """Static loss: a body at rest stays at rest, and its image is frame 0 (METHOD section 4)."""
 
-from __future__ import annotations
-
 import torch
 
 from gausim.core import Frame, SimState

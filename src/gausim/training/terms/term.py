@@ -1,7 +1,5 @@
 """Inputs of a loss term that does not need the rollout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
