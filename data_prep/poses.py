@@ -1,8 +1,8 @@
 """Find the poses of photos and of fixed video cameras with COLMAP, or take them over.
 
 The result is OUT/transforms.json with undistorted images/*.png (camera to world, OpenGL axes), points.npz (points,
-colours, errors) to begin a reconstruction with, cameras.png to look at, and for videos sequences/SEQ/transforms.json
-with the undistorted frames. Matching takes most of the time; interrupted, it goes on where it was.
+colours, errors) and cameras.png to look at, and for videos sequences/SEQ/transforms.json with the undistorted frames.
+Matching takes most of the time; interrupted, it goes on where it was.
 """
 
 from __future__ import annotations

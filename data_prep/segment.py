@@ -27,7 +27,7 @@ from data_prep.capture.masks.segmenters import Backend, MaskOf
 from data_prep.common.command import add_options, chosen, given, headline, run_command, stage_parser
 from data_prep.common.photos import read_picture, write_picture
 from data_prep.common.progress import Tick, silent
-from data_prep.common.stage import MANIFEST, Stage, copy_missing, read_manifest, run_stage
+from data_prep.common.stage import MANIFEST, Stage, read_manifest, run_stage
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
 from gausim.io.plain_json import read_json
@@ -165,8 +165,8 @@ def _rate(source: Path) -> float:
 
 
 def _beside(source: Path) -> dict[str, Path]:
-    """Files beside the pictures, by name: poses, facts, points."""
-    found = [*source.rglob("transforms.json"), *(source / name for name in ("dataset.json", "points.npz"))]
+    """Files beside the pictures, by name: poses and facts."""
+    found = [*source.rglob("transforms.json"), source / "dataset.json"]
     named = {path.relative_to(source).as_posix(): path for path in sorted(found) if path.is_file()}
     return {name: path for name, path in named.items() if not any(part.startswith(".") for part in Path(name).parts)}
 
@@ -175,9 +175,6 @@ def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) 
     """Copies what belongs to the pictures; ``transforms.json`` gets their new names."""
     done = {path.resolve() for path in pictures.values()}
     for name, path in files.items():
-        if path.suffix != ".json":
-            copy_missing(path, work / name)
-            continue
         data = read_json(path)
         for entry in data.get("frames", []) if isinstance(data.get("frames"), list) else []:
             named = entry.get("file_path") if isinstance(entry, dict) else None

@@ -84,7 +84,6 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
         return "\n".join(
             [*lines, f"scene       {results['scene']}", f"next        {train_command(facts['name'], out)}"]
         )
-    start = f" --points {out / 'points.npz'}" if results["points"] else ""
     return "\n".join(
-        [*lines, f"next        gausim reconstruct {out}{start}", f"then        {train_command(facts['name'], out)}"]
+        [*lines, f"next        gausim reconstruct {out}", f"then        {train_command(facts['name'], out)}"]
     )

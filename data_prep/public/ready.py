@@ -109,11 +109,10 @@ def read(root: Path, options: Options) -> PublicObject:
     extra = {name: sorted(set(cameras) - common) for name, cameras in used.items()}
     notes = {f"{name} left out": why for name, why in left_out.items()}
     notes |= {f"{name} without": ", ".join(cameras) for name, cameras in extra.items() if cameras}
-    points, facts = model.points, {f"{part}_sequences": [n for n in used if n in getattr(meta, part)]
-                                   for part in ("train", "test")}  # fmt: skip
+    facts = {f"{part}_sequences": [n for n in used if n in getattr(meta, part)] for part in ("train", "test")}
     return PublicObject(
         root, options.name or root.absolute().name, options.fps or FPS, options.train_frames or TRAIN_FRAMES,
-        tuple(motions), options.heldout, facts, tuple(stills), (points.xyz, points.rgb) if len(points.ids) else None,
+        tuple(motions), options.heldout, facts, tuple(stills),
         partial(write_scene, root=root, near=options.near),
         {**{f"sparse/{role}": path for role, path in colmap_files(model.path).items()}, "meta.json": root / "meta.json",
          **scene_files(root)}, notes,

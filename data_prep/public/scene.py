@@ -87,7 +87,6 @@ class PublicObject:
     heldout: tuple[str, ...] = ()  # cameras that are never trained on
     facts: Mapping[str, Any] = field(default_factory=dict)  # further fields of dataset.json, such as gravity
     stills: tuple[tuple[View, Picture], ...] = ()  # posed stills of the rest state; none: frame 0 of the first sequence
-    cloud: tuple[np.ndarray, np.ndarray] | None = None  # points (P, 3) to begin a reconstruction with, colours uint8
     scene: Callable[[Path], dict[str, int] | None] = lambda work: None  # writes the set's Gaussians, tells their number
     files: Mapping[str, Path] = field(default_factory=dict)  # what was read besides pictures, by name
     notes: Mapping[str, str] = field(default_factory=dict)  # what is worth telling

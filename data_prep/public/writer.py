@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from data_prep.capture.cameras.output import write_cameras
 from data_prep.common.objects import object_facts, refuse_faults
 from data_prep.common.photos import resized, write_picture
 from data_prep.common.progress import Tick
-from data_prep.common.stage import copy_missing, write_npz
+from data_prep.common.stage import copy_missing
 from data_prep.public.scene import Motion, Picture, PublicObject, View
 from gausim.core.errors import DataError
 from gausim.io.files import write_json
@@ -33,17 +31,14 @@ class ObjectWriter:
         for motion in found.motions:
             self._motion(motion)
         stills = self._stills()
-        if found.cloud is not None:
-            points, colors = found.cloud
-            write_npz(self._work / "points.npz", points=points.astype(np.float32), colors=colors)
         scene = found.scene(self._work)
         facts = object_facts(found.name, found.fps, found.views, found.heldout, found.train_frames) | dict(found.facts)
         write_json(self._work / "dataset.json", facts)
         if not self._bare:
             refuse_faults(self._work, out)
         frames = {motion.name: motion.count for motion in found.motions}
-        return {"facts": facts, "stills": stills, "sequences": frames, "points": found.cloud is not None,
-                "scene": scene, "without_alpha": sorted(self._bare), "notes": dict(found.notes)}  # fmt: skip
+        return {"facts": facts, "stills": stills, "sequences": frames, "scene": scene,
+                "without_alpha": sorted(self._bare), "notes": dict(found.notes)}  # fmt: skip
 
     def _motion(self, motion: Motion) -> None:
         folder = self._work / "sequences" / motion.name

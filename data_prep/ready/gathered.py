@@ -13,7 +13,7 @@ from gausim.io.pixels import read_header
 from gausim.io.plain_json import read_json
 from gausim.io.transforms import PosedImages, read_transforms
 
-TRANSFORMS, FACTS, POINTS = "transforms.json", "dataset.json", "points.npz"
+TRANSFORMS, FACTS = "transforms.json", "dataset.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,6 @@ class Gathered:
     stills: PosedImages | None  # those of the rest state; None where there are none
     sequences: Mapping[str, PosedImages]  # by name, all with the same cameras and rate
     facts: Mapping[str, Any]  # what a ``dataset.json`` beside them says already
-    points: Path | None  # points to begin a reconstruction with, where there are some
 
     def files(self) -> Iterator[tuple[str, Path]]:
         """Every file to copy, by its name in the assembled object."""
@@ -32,8 +31,6 @@ class Gathered:
             yield f"{place}/{TRANSFORMS}", posed.path
             for name in dict.fromkeys(_inside(posed.path, frame.path) for frame in posed.frames):
                 yield f"{place}/{name}", posed.path.parent / name
-        if self.points is not None:
-            yield POINTS, self.points
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -51,7 +48,6 @@ def gather(folders: Sequence[Path]) -> Gathered:
     stills: PosedImages | None = None
     sequences: dict[str, PosedImages] = {}
     facts: dict[str, Any] = {}
-    points: Path | None = None
     for folder in folders:
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder. Expected the result of segment, or of poses.")
@@ -65,10 +61,9 @@ def gather(folders: Sequence[Path]) -> Gathered:
         stills = _posed(still) if still is not None else stills
         sequences.update({film.name: _posed(film) for film in films})
         facts.update(read_json(folder / FACTS) if (folder / FACTS).is_file() else {})
-        points = folder / POINTS if (folder / POINTS).is_file() else points
     ordered = {name: sequences[name] for name in sorted(sequences, key=natural)}
     _check_alike(ordered)
-    return Gathered(stills, ordered, facts, points)
+    return Gathered(stills, ordered, facts)
 
 
 def _sequences(folder: Path) -> list[Path]:

@@ -18,7 +18,6 @@ from gausim.data.images import write_rgba
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
 from gausim.reconstruction.reconstruction import ReconstructionOptions, reconstruct
-from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet, measure, reduced
 from gausim.render.cpu import CpuRenderer
@@ -83,11 +82,7 @@ def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) ->
     assert float(ratio.quantile(0.9)) < 6
 
 
-def test_points_may_be_the_start_and_it_stops_where_steps_do_not_help(stills: ImageSet) -> None:
-    options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16)
-    points = true_scene().means[::2]
-    scene = reconstruct([stills], RENDERER, options, cloud=PointCloud(points))
-    assert torch.cdist(scene.means, points).amin(1).max() < 0.02
+def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
     still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
     options = replace(TINY, iterations=100, patience=2, rates=still, random_background=False)
     steps: list[int] = []
@@ -185,9 +180,7 @@ def test_command_pins_below_the_height_that_the_data_set_states(stills: ImageSet
         assert torch.equal(scene.pinned, scene.means[:, 2] < height) and scene.pinned.any()
 
 
-def test_command_refuses_photos_without_masks_and_begins_at_given_points(
-    stills: ImageSet, tmp_path: Path, capsys
-) -> None:
+def test_command_refuses_photos_without_masks_and_leaves_some_out(stills: ImageSet, tmp_path: Path, capsys) -> None:
     def without_alpha(path: Path, image: Tensor) -> None:
         assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., :3].flip(-1).numpy()))
 
@@ -195,14 +188,7 @@ def test_command_refuses_photos_without_masks_and_begins_at_given_points(
     assert main([*written(stills, tmp_path / "bare", without_alpha), "--iterations", "30"]) == 2
     assert "got 40x40 RGB" in capsys.readouterr().err
     command = [*written(stills, tmp_path, write_rgba), "--iterations", "30", "--kernels", "90"]
-    points = true_scene().means.numpy()
-    colors = np.full(points.shape, 90, np.uint8)
-    command += ["--points", str(tmp_path / "points.npz")]
-    np.savez(tmp_path / "points.npz", points=points, colors=colors)
     assert main([*command, "--leave-out", "12", "--longest", "30"]) == 0
     measured = json.loads((tmp_path / "scene.json").read_text())["measured"]
     assert measured["stills left out"]["images"] == 2 and measured["stills to train on"]["images"] == 22
     assert not list(tmp_path.glob(".*"))
-    np.savez(tmp_path / "points.npz", points=points, colors=colors[:3])
-    assert main(command) == 2
-    assert f"'colors' must be ({len(points)}, 3)" in capsys.readouterr().err

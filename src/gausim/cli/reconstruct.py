@@ -15,7 +15,6 @@ from gausim.core.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from gausim.core import GaussianScene, Renderer
     from gausim.reconstruction.reconstruction import ReconstructionOptions
-    from gausim.reconstruction.splat_start import PointCloud
     from gausim.reconstruction.stills import ImageSet, Material
 
 
@@ -68,10 +67,10 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
-    name, material, cloud, below_z = _inputs(source, arguments)
+    name, material, below_z = _inputs(source, arguments)
     renderer = CpuRenderer()
     start = time.process_time()
-    scene = pinned_by(_fit(material, renderer, options, cloud, name), arguments.pin, below_z=below_z)
+    scene = pinned_by(_fit(material, renderer, options, name), arguments.pin, below_z=below_z)
     seconds = time.process_time() - start
     save_scene(scene, out)
     record = {
@@ -95,8 +94,6 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="harmonics of this degree (default %(default)s)")
     add("--anisotropy", type=float, default=3.0, metavar="R", help="penalise a length over width of a kernel above R "
         "(default %(default)s)")  # fmt: skip
-    add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
-        "of the masks' visual hull")  # fmt: skip
     add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="let this fraction of the stills "
         "have masks that lack a part that all others show (default %(default)s)")  # fmt: skip
     add("--video-share", type=float, default=0.5, metavar="FRACTION",
@@ -119,8 +116,8 @@ def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
     )  # fmt: skip
 
 
-def _inputs(source: Path, arguments: argparse.Namespace) -> tuple[str, Material, PointCloud | None, float | None]:
-    """Name, images, points to begin with, and the height below which the data set has its pins."""
+def _inputs(source: Path, arguments: argparse.Namespace) -> tuple[str, Material, float | None]:
+    """Name, images, and the height below which the data set has its pins."""
     from gausim.data.objects import ObjectData
     from gausim.reconstruction.stills import gather_object, gather_stills
 
@@ -131,36 +128,12 @@ def _inputs(source: Path, arguments: argparse.Namespace) -> tuple[str, Material,
     if source.name == "dataset.json":
         data = ObjectData(source.parent)
         material = gather_object(data, video_fraction=arguments.video_share)
-        return data.name, material, _cloud(arguments.points), data.pinned_below_z
+        return data.name, material, data.pinned_below_z
     material = gather_stills(source, every=arguments.leave_out, longest=arguments.longest, coarse=0.5)
-    return source.parent.name or "scene", material, _cloud(arguments.points), None
+    return source.parent.name or "scene", material, None
 
 
-def _cloud(path: str | None) -> PointCloud | None:
-    if path is None:
-        return None
-    import torch
-
-    from gausim.io.npz import read_npz
-    from gausim.reconstruction.splat_start import PointCloud
-
-    try:
-        arrays = read_npz(Path(path), ["points", "colors"])
-    except ValueError as error:
-        raise DataError(f"{path}: cannot be read as npz ({error}).") from error
-    points, colors = arrays.get("points"), arrays.get("colors")
-    if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
-        raise DataError(f"{path}: expected an array 'points' (P, 3) of floats. Take the points.npz that `poses` wrote.")
-    if colors is None:
-        return PointCloud(torch.from_numpy(points).float())
-    if colors.shape != points.shape or colors.dtype != "uint8":
-        raise DataError(f"{path}: array 'colors' must be {points.shape} of uint8, got {colors.shape} {colors.dtype}.")
-    return PointCloud(torch.from_numpy(points).float(), torch.from_numpy(colors).float() / 255)
-
-
-def _fit(
-    material: Material, renderer: Renderer, options: ReconstructionOptions, cloud: PointCloud | None, name: str
-) -> GaussianScene:
+def _fit(material: Material, renderer: Renderer, options: ReconstructionOptions, name: str) -> GaussianScene:
     from rich.progress import TextColumn, TimeRemainingColumn
 
     from gausim.reconstruction.reconstruction import Reconstruction, reconstruct
@@ -172,7 +145,7 @@ def _fit(
         def show(run: Reconstruction) -> None:
             bar.update(task, completed=run.done, state=f"loss {run.loss:.5f}  kernels {run.splats.count}")
 
-        return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show)
+        return reconstruct(material.train, renderer, options, name=name, progress=show)
 
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from gausim.core import ConfigError, DivergenceError, GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.losses.image import ImageLoss
-from gausim.reconstruction.splat_start import PointCloud, start_object
+from gausim.reconstruction.splat_start import start_object
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet
 
@@ -83,22 +83,20 @@ def reconstruct(
     renderer: Renderer,
     options: ReconstructionOptions,
     *,
-    cloud: PointCloud | None = None,
     name: str = "scene",
     progress: Callable[[Reconstruction], None] | None = None,
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
-    Kernels start on the surface of the visual hull of the first set, or on the points of ``cloud`` in it. They are
-    split where the images' error is largest and pruned where they are transparent, never seen or out of bounds,
-    because the dynamics moves every kernel. All are simulated and foreground, none pinned. ``progress`` is called
-    after every step.
+    Kernels start on the surface of the visual hull of the first set. They are split where the images' error is largest
+    and pruned where they are transparent, never seen or out of bounds, because the dynamics moves every kernel. All
+    are simulated and foreground, none pinned. ``progress`` is called after every step.
 
     Raises:
-        DataError: no body projects into all masks, or no points lie in it.
+        DataError: no body projects into all masks.
         DivergenceError: the loss is not finite, or pruning left fewer than two kernels.
     """
-    run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
+    run = Reconstruction(sets, renderer, options, name=name)
     while not run.finished:
         run.step()
         if progress is not None:
@@ -121,14 +119,13 @@ class Reconstruction:
         renderer: Renderer,
         options: ReconstructionOptions,
         *,
-        cloud: PointCloud | None,
         name: str,
     ) -> None:
         """Places the first kernels (see :func:`reconstruct`)."""
         self._sets, self._renderer, self._options, self._name = list(sets), renderer, options, name
         self._start = start = start_object(
             sets[0], round(START_FRACTION * options.kernels), resolution=options.hull_resolution,
-            missing=options.missing_masks, cloud=cloud, name=name,
+            missing=options.missing_masks, name=name,
         )  # fmt: skip
         self.splats = Splats(
             start.points, start.colors, start.scales, sh_degree=options.sh_degree, opacity=0.8, rates=options.rates,

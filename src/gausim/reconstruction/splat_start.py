@@ -1,4 +1,4 @@
-"""Initial Gaussians and their bounds: on the visual hull of the masks, or on points in it."""
+"""Initial Gaussians and their bounds, on the visual hull of the masks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,22 +24,6 @@ OBJECT_CEILING = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class PointCloud:
-    """Points at which kernels start."""
-
-    points: Float[Tensor, "P 3"]  # positions [scene units]
-    colors: Float[Tensor, "P 3"] | None = None  # RGB in [0, 1]; None reads them from the images
-
-    def __post_init__(self) -> None:
-        """Checks the numbers, or raises :class:`DataError`."""
-        if len(self.points) < 2 or not torch.isfinite(self.points).all():
-            raise DataError(
-                f"points: expected at least two finite points to start from, got {len(self.points)}. "
-                "Find the poses again, or start from the masks' visual hull."
-            )
-
-
-@dataclass(frozen=True, eq=False)
 class Start:
     """K initial balls."""
 
@@ -51,16 +35,14 @@ class Start:
     extent: float  # unit of the positions' learning rate [scene units]
 
 
-def start_object(
-    images: ImageSet, count: int, *, resolution: int, missing: float, cloud: PointCloud | None, name: str
-) -> Start:
-    """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
+def start_object(images: ImageSet, count: int, *, resolution: int, missing: float, name: str) -> Start:
+    """``count`` balls evenly over the surface of the visual hull of the masks.
 
     The object is where alpha > 0. The hull has ``resolution`` voxels along its longest side; ``missing`` is the
     fraction of the views whose masks may lack a part that all others show.
 
     Raises:
-        DataError: no body projects into all masks, or no point lies in it.
+        DataError: no body projects into all masks.
     """
     masks = images.images[..., 3] > 0
     hull = carve(masks, images.cameras.viewmats, images.cameras.Ks, resolution, missing=missing)
@@ -72,22 +54,12 @@ def start_object(
         )
     room = hull.dilated(MARGIN)
     points, normals = hull.surface()
-    colors = None
-    if cloud is not None:
-        inside = room.contains(cloud.points)
-        if inside.sum() < 2:
-            raise DataError(
-                f"{name}: {int(inside.sum())} of {len(inside)} points lie in the visual hull of the masks. Check that "
-                "points and poses are of one world, or leave the points out."
-            )
-        points, normals = cloud.points[inside].float(), torch.zeros(int(inside.sum()), 3)
-        colors = None if cloud.colors is None else cloud.colors[inside]
     index = farthest_points(points, max(2, count))
     points, normals = points[index], normals[index]
     distance = neighbour_distance(points)
-    chosen = _surface_colors(points, normals, images) if colors is None else colors[index]
+    colors = _surface_colors(points, normals, images)
     scales, ceiling = 0.6 * distance.clamp_min(1e-3 * hull.spacing), OBJECT_CEILING * float(distance.mean())
-    return Start(points, chosen, scales, room.contains, ceiling, hull.diagonal)
+    return Start(points, colors, scales, room.contains, ceiling, hull.diagonal)
 
 
 def neighbour_distance(points: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:
