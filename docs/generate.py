@@ -129,16 +129,21 @@ def _file(name: str) -> Iterator[str]:
 def _meanings(path: Path) -> dict[str, str]:
     """What the keys of a file mean, by their whole names.
 
-    The comment behind a key, else that in the file that this one begins with, else the documentation of the class.
+    The comment behind a key, else that in the first of the files that this one begins with, else the documentation of
+    the class. A later file's comment is on its own value.
     """
+    return _defined(path) | {key: text for key, text in _comments(path).items() if text}
+
+
+def _defined(path: Path) -> dict[str, str]:
+    """Meanings of keys in the file that has them first."""
     node = yaml.safe_load(path.read_text()) or {}
     names = [entry.split("@")[0] for entry in node.get("defaults", []) if isinstance(entry, str)]
     bases = [(conf_dir() / name[1:] if name[0] == "/" else path.parent / name).with_suffix(".yaml") for name in names]
     found: dict[str, str] = {}
-    for base in filter(Path.is_file, bases):
-        found |= _meanings(base)
-    found |= {key: text for key, text in _documented(node).items() if not found.get(key)}
-    return found | {key: text for key, text in _comments(path).items() if text}
+    for meanings in (*map(_defined, filter(Path.is_file, bases)), _comments(path), _documented(node)):
+        found |= {key: text for key, text in meanings.items() if not found.get(key)}
+    return found
 
 
 def _documented(node: dict[str, Any], prefix: str = "") -> dict[str, str]:
