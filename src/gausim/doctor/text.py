@@ -10,27 +10,27 @@ from gausim.doctor.examine import Examination
 _WIDTH = 118
 
 
-def findings_text(root: str, found: Examination) -> str:
+def findings_text(root: str, examination: Examination) -> str:
     """All findings of an object, for a terminal."""
-    lines = [f"{root}: {summary_line(found)}"]
-    for finding in found.findings:
+    lines = [f"{root}: {summary_line(examination)}"]
+    for finding in examination.findings:
         head = f"  {finding.severity.upper()}  {finding.check}: {finding.what}"
         lines += textwrap.wrap(head, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
         lines += textwrap.wrap(f"Remedy: {finding.remedy}", _WIDTH, initial_indent="    ", subsequent_indent="    ",
                                break_long_words=False, break_on_hyphens=False)  # fmt: skip
-    for cause in dict.fromkeys(found.left_out.values()):
-        names = listed([name for name, other in found.left_out.items() if other == cause])
+    for cause in dict.fromkeys(examination.left_out.values()):
+        names = listed([name for name, other in examination.left_out.items() if other == cause])
         lines.append(f"  Not checked until the fault of '{cause}' is mended: {names}.")
     return "\n".join(lines)
 
 
-def summary_line(found: Examination) -> str:
+def summary_line(examination: Examination) -> str:
     """Number of findings of each severity, and of the frames and views that were examined."""
-    counts = [(severity, sum(f.severity == severity for f in found.findings)) for severity in SEVERITIES]
+    counts = [(severity, sum(f.severity == severity for f in examination.findings)) for severity in SEVERITIES]
     told = ", ".join(f"{n} {severity}{'s' if n > 1 else ''}" for severity, n in counts if n)
     if not counts[0][1] and not counts[1][1]:
         told = "nothing is wrong"
-    evidence = found.evidence
+    evidence = examination.evidence
     if evidence is None:
         return f"{told}."
     frames = max(len(item.alpha) for item in evidence.watched)
@@ -40,6 +40,6 @@ def summary_line(found: Examination) -> str:
     )
 
 
-def plain_findings(found: Examination) -> dict[str, Any]:
+def plain_findings(examination: Examination) -> dict[str, Any]:
     """Findings and omitted checks as plain data for JSON."""
-    return {"findings": [asdict(finding) for finding in found.findings], "left_out": found.left_out}
+    return {"findings": [asdict(finding) for finding in examination.findings], "left_out": examination.left_out}
