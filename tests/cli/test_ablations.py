@@ -86,8 +86,8 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path) ->
         return [*found, determinants([step_of(module).deformation_gradients])]
 
     # Free is a hundred times what conservation leaves.
-    *found, template = of("no_mass")
-    assert max(of("none")) < 1e-4 and min(found) > 0.01 and template > 1e-3, (found, template)
+    conserved, found = max(of("none")), of("no_mass")
+    assert conserved < 1e-4 and min(found) > max(1e-3, 100 * conserved), (conserved, found)
     # Single kernels are corrected little, and conservation leaves less of it, so here it is a thousand times.
     conserved, free = of("no_hierarchy"), of("[no_mass,no_hierarchy]")
     assert max(conserved) < 1e-4, conserved

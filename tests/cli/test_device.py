@@ -26,7 +26,7 @@ WRONG = {
     *("accelerator", "num-threads", "nthreads", "jobs"),
 }
 PRESENT = {
-    "objects": ("evaluate", "simulate", "view", "export", "inspect"), "sequences": ("evaluate", "simulate", "adapt"),
+    "objects": ("evaluate", "simulate", "view", "export"), "sequences": ("evaluate", "simulate", "adapt"),
     "cameras": ("evaluate", "simulate", "export"), "device": ("evaluate", "simulate", "view", "export"),
     "threads": ("evaluate", "simulate", "view", "export", "doctor", "reconstruct"), "overwrite": ("adapt",),
     "pin": ("inspect", "reconstruct", "doctor", "simulate", "view"),
