@@ -140,6 +140,10 @@ def _write(motion: Motion, path: Path, arguments: argparse.Namespace) -> None:
         from gausim.io.ply_sequence import save_ply_sequence
 
         save_ply_sequence(path, motion.name, motion.scenes(), motion.trajectory.fps)
+    elif arguments.format == "usd":
+        from gausim.io.usd import save_usd
+
+        save_usd(path, motion.scenes(), motion.trajectory.fps, up=arguments.up)
     elif arguments.format == "html":
         from gausim.io.player import save_player
 
@@ -191,6 +195,7 @@ FORMATS = {
                    "network", "digits beyond a thousandth"),
     "page": Format(".html", "the learned template, to be pulled in a browser without a network", "the network"),
     "ply": Format("", "a 3DGS PLY per frame, with turned spherical harmonics and masks", "units and their deformation"),
+    "usd": Format(".usdc", "an OpenUSD particle field of splats with a time sample per frame", "masks, units"),
     "mp4": Format(".mp4", "pictures of one camera", "everything else"),
     "gif": Format(".gif", "pictures of one camera, 256 colours", "everything else"),
 }  # fmt: skip

@@ -25,7 +25,7 @@ COMMANDS = {
     "evaluate": "Measure a run on seen, unseen and held-out frames.",
     "simulate": "Roll a run forward and write videos, figures and trajectories.",
     "view": "Simulate a run or a scene interactively in the browser.",
-    "export": "Write a page to pull the object, or a motion as HTML, PLY, MP4 or GIF.",
+    "export": "Write a page to pull the object, or a motion as HTML, PLY, OpenUSD, MP4 or GIF.",
     "report": "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV.",
 }
 
