@@ -141,14 +141,6 @@ def number_field(fields: dict[str, Any], key: str, where: str) -> float:
     return float(value)
 
 
-def positive_field(fields: dict[str, Any], key: str, where: str) -> float:
-    """A field that must be a positive finite number, or :class:`DataError` that names it."""
-    value = number_field(fields, key, where)
-    if value <= 0:
-        raise DataError(f"{where}: field '{key}' must be a positive number, got {value:g}.")
-    return value
-
-
 def lens_fields(data: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
     """The fields of the file and of an entry, which wins: its focal length replaces the file's in either form."""
     own = [axis for axis in "xy" if f"fl_{axis}" in entry or f"camera_angle_{axis}" in entry]
