@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gausim.core import GaussianScene
 from gausim.models.step.simulator import GausSim
+from gausim.runs.cost import process_memory
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,13 @@ def medians(
             else:
                 times[name].append(seconds)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def peak_memory(case: str, device: torch.device) -> Row:
+    """Peak memory so far: allocated on the device, or resident in this process."""
+    on_gpu = device.type == "cuda"
+    held = torch.cuda.max_memory_allocated(device) if on_gpu else process_memory("VmHWM") or 0
+    return Row(case, f"{'device' if on_gpu else 'process'} memory, at most", held / 2**20, "MiB")
 
 
 class _Kept:

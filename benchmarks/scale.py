@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import torch
 
-from benchmarks.harness import Options, Row
+from benchmarks.harness import Options, Row, peak_memory
 from benchmarks.train import Case
 from gausim.core import ConfigError
 from gausim.data.datamodule import ReadyDataModule
@@ -75,9 +75,7 @@ def measure(options: Options, module: GausSimModule, data: ReadyDataModule, plan
     whole = f"{SEQUENCES} sequences, {plan.epochs} epochs of {plan.repeats} uses"
     rows += [Row(whole, stage, seconds / 3600, "h") for stage, seconds in stages.items()]
     rows.append(Row(whole, "training", sum(stages.values()) / 3600, "h"))
-    on_gpu = options.device.type == "cuda"
-    most = torch.cuda.max_memory_allocated(options.device) if on_gpu else process_memory("VmHWM") or 0
-    rows.append(Row(name, f"{'device' if on_gpu else 'process'} memory, at most", most / 2**30, "GiB"))
+    rows.append(peak_memory(name, options.device))
     return [*rows, Row(name, "resident memory, all sequences read", grown, "x", "before")]
 
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch.optim import Optimizer
 
-from benchmarks.harness import Options, Row, medians, peak_saved_bytes
+from benchmarks.harness import Options, Row, medians, peak_memory, peak_saved_bytes
 from gausim.core import ConfigError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.kernels.operations import OPERATIONS, plain_forms
-from gausim.runs.cost import process_memory
 from gausim.training.module import GausSimModule
 
 SEQUENCES = 4  # of an optimiser step, at most
@@ -94,6 +93,4 @@ def measure(
     rows.append(Row(name, "throughput / plain", found["plain"] / found["own"], "x", plain))
     rows += [Row(name, f"speed-up by {form}", found[form] / found["own"], "x", "its plain form") for form in OPERATIONS]
     rows.append(Row(name, "held for the backward pass, at most", peak_saved_bytes(case.step) / 2**20, "MiB"))
-    on_gpu = options.device.type == "cuda"
-    held = torch.cuda.max_memory_allocated(options.device) if on_gpu else process_memory("VmHWM") or 0
-    return [*rows, Row(name, f"{'device' if on_gpu else 'process'} memory, at most", held / 2**20, "MiB")]
+    return [*rows, peak_memory(name, options.device)]
