@@ -1,7 +1,7 @@
 import subprocess
 import sys
 
-HEAVY = ("torch", "lightning", "pytorch_lightning", "wandb", "viser", "hydra", "omegaconf", "numpy", "kornia", "numba")
+HEAVY = ("torch", "lightning", "pytorch_lightning", "wandb", "viser", "hydra", "omegaconf", "numpy", "numba")
 LIST_MODULES = "\nimport sys\nprint('MODULES', *sorted({name.split('.')[0] for name in sys.modules}))"
 
 
@@ -24,7 +24,7 @@ def test_completing_a_configuration_loads_hydra_and_no_torch() -> None:
 
 
 def test_core_needs_no_viewer_and_training_without_a_dashboard_imports_none() -> None:
-    unwanted = {"lightning", "pytorch_lightning", "wandb", "viser", "hydra", "kornia"}
+    unwanted = {"lightning", "pytorch_lightning", "wandb", "viser", "hydra"}
     core = f"from gausim.core import GaussianScene; import sys; assert not {unwanted!r} & set(sys.modules)"
     rooms = "import gausim.compose.build, gausim.training.callbacks.panels, gausim.training.dashboards"
     modules = imported_by(f"{core}; {rooms}")

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gausim.kernels.jit import caching
 from gausim.kernels.operations import OPERATIONS, Operation, plain_forms
-from gausim.losses.image import gaussian_taps, image_loss
 from gausim.ops.deformation import polar_rotation
+from gausim.ops.similarity import gaussian_taps, image_loss
 from gausim.render.draw import deformed_appearance
 
 

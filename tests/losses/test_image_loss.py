@@ -9,9 +9,9 @@ from kornia.metrics import ssim
 from torch import Tensor
 
 from gausim.core import ConfigError
-from gausim.losses import ImageLoss, Objective, static_loss, structural_similarity
-from gausim.losses.image import gaussian_taps
+from gausim.losses import ImageLoss, Objective, static_loss
 from gausim.losses.mixed import MixedLoss
+from gausim.ops.similarity import gaussian_taps, structural_similarity
 
 
 def images(batch: int = 3, height: int = 17, width: int = 23, channels: int = 3) -> tuple[Tensor, Tensor]:

@@ -24,8 +24,6 @@ ALLOWED_PACKAGES = (
     "torchmetrics.aggregation",
     "torchmetrics.image",
     "torchmetrics.regression",
-    "kornia.losses",
-    "kornia.metrics",
 )
 ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
 # Exceptions inside the allowed packages, which start programs or write files.

@@ -1,4 +1,4 @@
-"""Fast form of :func:`gausim.losses.image.image_loss`: one pass over the rows of each image.
+"""Fast form of :func:`gausim.ops.similarity.image_loss`: one pass over the rows of each image.
 
 An image is a flat run of H W 3 floats. For each row inside the box that is not black, five maps (x, y, x^2, x y, y^2)
 are blurred along H, then along W, and give the derivatives of SSIM with respect to the blurred x, x^2 and x y. These
@@ -238,7 +238,7 @@ def compare(x, y, shape, taps, slots, by_error, by_ssim, gradient):
 def image_loss(
     prediction: Tensor, target: Tensor, taps: tuple[float, ...], *, balance: float, scale: float
 ) -> tuple[Tensor, Tensor]:
-    """:func:`gausim.losses.image.image_loss`, on torch's number of threads."""
+    """:func:`gausim.ops.similarity.image_loss`, on torch's number of threads."""
     states, views, height, width, _ = prediction.shape
     x, y = (array(v).reshape(states * views, -1) for v in (prediction, target))
     gradient, sums = np.empty_like(x), np.empty((states * views, 2))

@@ -1,6 +1,6 @@
 """Losses of training: images, rest state, and momentum between levels."""
 
-from gausim.losses.image import ImageLoss, structural_similarity
+from gausim.losses.image import ImageLoss
 from gausim.losses.objective import Objective, static_loss
 
-__all__ = ["ImageLoss", "Objective", "static_loss", "structural_similarity"]
+__all__ = ["ImageLoss", "Objective", "static_loss"]

@@ -5,7 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError
-from gausim.losses.image import ImageLoss, gaussian_taps, structural_similarity
+from gausim.losses.image import ImageLoss
+from gausim.ops.similarity import gaussian_taps, structural_similarity
 
 # Size of the SSIM window of 3DGS and the methods after it [pixels].
 SSIM_WINDOW = 11
