@@ -149,6 +149,7 @@ def tiny(root: Path) -> None:
         return np.pad(cv2.resize(pixels, (16, 16), interpolation=cv2.INTER_AREA), ((24, 24), (24, 24), (0, 0)))
 
     mistakes.every_transforms(root, lambda data: data.update(fl_x=data["fl_x"] / 4, fl_y=data["fl_y"] / 4))
+    mistakes.every_transforms(root, lambda data: data.pop("camera_angle_x", None))
     mistakes.every_image(root, shrink)
 
 
@@ -257,6 +258,21 @@ def test_a_free_body_needs_no_pin_and_may_begin_elsewhere(spoilt: Path, capsys: 
     _, entry = told(spoilt, capsys)
     assert "pins" not in found(entry)
     assert not any("not at rest" in f["what"] for f in entry["findings"])
+
+
+def test_a_free_body_is_compared_where_the_cameras_see_it(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = load_scene(spoilt / "scene.ply")
+    scene.means.add_(torch.tensor([0.6, -0.4, 2.0]))
+    save_scene(scene, spoilt / "scene.ply")
+    edit_json(spoilt / "dataset.json", lambda data: data.update(free=True))
+    status, entry = told(spoilt, capsys)
+    assert status == 0 and found(entry) == {} and not any(f["check"] == "calibration" for f in entry["findings"])
+    mistakes.moved_camera(spoilt)
+    assert "cam_1 is not where the pose says" in found(told(spoilt, capsys)[1])["calibration"]["what"]
+    scene.means.copy_(scene.means @ torch.tensor([[0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.8, 0.0, 0.6]]))
+    save_scene(scene, spoilt / "scene.ply")
+    status, entry = told(spoilt, capsys)
+    assert status == 0 and any("begins turned or bent" in f["what"] for f in entry["findings"])
 
 
 @pytest.mark.slow

@@ -53,6 +53,7 @@ def lens(root: Path, *, written: bool) -> None:
             del data["fl_x"], data["fl_y"]
             data["camera_angle_x"] = angle
         else:
+            data.pop("camera_angle_x", None)
             data["fl_x"] = data["fl_y"] = abs(data["w"] / (2 * math.tan(angle / 2)))
 
     every_transforms(root, change)

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import Cameras, GaussianScene
+from gausim.core import Cameras
 from gausim.doctor.evidence import Evidence, Finding, listed
-from gausim.doctor.silhouettes import Fit, draw_silhouettes, overlap
+from gausim.doctor.silhouettes import Fit, overlap
 from gausim.io.transforms import OPENGL_TO_OPENCV
 
 # Overlap below which a silhouette misses the object, and above which a reading of the calibration fits.
@@ -20,6 +20,8 @@ _MISSED, _FITS = 0.5, 0.8
 _WORTH, _SPOILS = 0.006, 0.012
 # Overlap after the best shift and rotation, below which scene and object differ in shape.
 _SHAPE = 0.85
+# The same, below which a free body is not in its rest shape and orientation.
+_AT_REST = 0.97
 # Ratios of common units of length: millimetres, centimetres and metres.
 _UNITS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
 # Iterations of the estimate of the focal length from areas.
@@ -28,7 +30,10 @@ _AXES = torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
 
 
 def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Compares the rest scene's silhouettes with frame 0 in every camera, and tests other conventions."""
+    """Compares the rest scene's silhouettes with frame 0 in every camera, and tests other conventions.
+
+    A free body is drawn where the cameras see it in frame 0; where it begins turned or bent, no more is known.
+    """
     if evidence.fits is None:
         yield Finding(
             "note", "There is no rest scene yet, so poses and lenses were not compared with it.",
@@ -39,6 +44,8 @@ def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
     raw = {view: float(np.median([fit.overlap for fit in row])) for view, row in fits.items()}
     if sum(value < _MISSED for value in raw.values()) > len(raw) / 2:
         yield _convention(evidence, raw)
+    elif evidence.free and np.median([[fit.aligned for fit in row] for row in evidence.fits]) < _AT_REST:
+        yield _turned(evidence)
     else:
         yield from _moved(evidence, fits)
         yield from _shape(fits)
@@ -108,13 +115,13 @@ def _shape(fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
 
 
 def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
-    assert evidence.scene is not None
-    item = evidence.first[0]
-    readings = _readings(evidence.scene, item.alpha[0] / np.float32(255), item.cameras)
+    readings = _readings(evidence)
     best, now = readings[0], float(np.mean(list(raw.values())))
     fits = best.overlap > max(_FITS, now + 0.2)
     what = f"The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}."
     remedy = f"In every sequences/*/transforms.json {best.remedy}."
+    if not fits and evidence.free:
+        return _turned(evidence)
     if not fits:
         what = f"No usual mistake explains it (best: {best.name}, overlap {best.overlap:.2f})."
         remedy = (
@@ -128,6 +135,14 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
     )  # fmt: skip
 
 
+def _turned(evidence: Evidence) -> Finding:
+    return Finding(
+        "note", "The free body begins turned or bent, so poses and lenses were not compared with the rest scene.",
+        f"Look at views.png (`gausim doctor {evidence.data.root} --out DIR`): the outline must have the body's place "
+        "and size in all cameras.",
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class _Reading:
     """The calibration under another convention."""
@@ -137,20 +152,22 @@ class _Reading:
     overlap: float  # mean intersection over union of the silhouettes over the views
 
 
-def _readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> list[_Reading]:
+def _readings(evidence: Evidence) -> list[_Reading]:
     """Readings of the cameras under common conventions, sorted by their fit to the masks of frame 0, the best first."""
+    cameras = evidence.first[0].cameras
     # The matrices of the file: camera to world, OpenGL axes.
     stored = torch.linalg.inv(cameras.viewmats.double()) * _AXES
     readings = []
     for name, remedy, change in _POSES:
         viewmats = torch.stack([change(pose) for pose in stored]).float()
-        readings.append(_Reading(name, remedy, _fit(scene, masks, replace(cameras, viewmats=viewmats))))
-    readings.append(_another_lens(scene, masks, cameras))
+        readings.append(_Reading(name, remedy, _fit(evidence, replace(cameras, viewmats=viewmats))))
+    readings.append(_another_lens(evidence))
     return sorted(readings, key=lambda reading: -reading.overlap)
 
 
-def _fit(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> float:
-    drawn = draw_silhouettes(scene, cameras).alpha
+def _fit(evidence: Evidence, cameras: Cameras) -> float:
+    item = evidence.first[0]
+    masks, drawn = item.alpha[0] / np.float32(255), evidence.drawn(item, cameras).alpha
     return float(np.mean([overlap(mask, alpha) for mask, alpha in zip(masks, drawn, strict=True)]))
 
 
@@ -196,11 +213,13 @@ _POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [
 ]  # fmt: skip
 
 
-def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> _Reading:
+def _another_lens(evidence: Evidence) -> _Reading:
     """The same poses with the focal length at which silhouettes have the right size."""
+    item = evidence.first[0]
+    masks, cameras = item.alpha[0] / np.float32(255), item.cameras
     lenses = cameras.Ks.clone()
     for _ in range(_ROUNDS):
-        drawn = draw_silhouettes(scene, replace(cameras, Ks=lenses)).alpha
+        drawn = evidence.drawn(item, replace(cameras, Ks=lenses)).alpha
         seen = [v for v in range(len(masks)) if drawn[v].sum() > 0 and masks[v].sum() > 0]
         if not seen:
             break
@@ -213,4 +232,4 @@ def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camer
         f"multiply fl_x and fl_y by {factor:.3g} (they may have been made from an angle in degrees where radians were "
         "expected, or for pictures of another size; then cx and cy are wrong too)"
     )
-    return _Reading(name, remedy, _fit(scene, masks, replace(cameras, Ks=lenses)))
+    return _Reading(name, remedy, _fit(evidence, replace(cameras, Ks=lenses)))

@@ -119,7 +119,7 @@ def find_outliers(evidence: Evidence) -> Iterator[Finding]:
 def find_pins(evidence: Evidence) -> Iterator[Finding]:
     """Finds scenes without pinned kernels, or with nearly all pinned; nothing holds a free body."""
     scene = evidence.scene
-    if scene is None or evidence.data.surroundings.free:
+    if scene is None or evidence.free:
         return
     try:
         require_pinned(scene)

@@ -77,15 +77,26 @@ class Evidence:
         """Names of the cameras, in the order of all arrays."""
         return self.data.views
 
+    @property
+    def free(self) -> bool:
+        """Whether nothing holds the body, so that it may begin away from the place of the rest scene."""
+        return self.data.surroundings.free
+
+    def drawn(self, item: Watched, cameras: Cameras) -> Silhouettes:
+        """The rest scene rendered in cameras, a free body where it is in frame 0 of ``item``."""
+        assert self.scene is not None
+        return draw_silhouettes(self.scene, cameras, item.alpha[0] / np.float32(255) if self.free else None)
+
     @cached_property
     def rest(self) -> tuple[Silhouettes, ...] | None:
-        """The rest scene rendered in the cameras of each of :attr:`first`; None without a scene."""
+        """The rest scene rendered for each of :attr:`first`, see :meth:`drawn`; None without a scene."""
         if self.scene is None:
             return None
         drawn: list[Silhouettes] = []
         for item in self.first:
-            same = next((i for i in range(len(drawn)) if same_cameras(self.first[i].cameras, item.cameras)), None)
-            drawn.append(draw_silhouettes(self.scene, item.cameras) if same is None else drawn[same])
+            alike = (i for i in range(len(drawn)) if same_cameras(self.first[i].cameras, item.cameras))
+            same = None if self.free else next(alike, None)
+            drawn.append(self.drawn(item, item.cameras) if same is None else drawn[same])
         return tuple(drawn)
 
     @cached_property

@@ -86,7 +86,7 @@ def _displacements(item: Watched, scale: float) -> np.ndarray:
 
 def find_unrest(evidence: Evidence) -> Iterator[Finding]:
     """Finds sequences whose frame 0 is not the rest state; a free body may begin elsewhere."""
-    if evidence.data.surroundings.free:
+    if evidence.free:
         return
     overlaps = _first_overlaps(evidence)
     off = {name: value for name, value in overlaps.items() if value < _AT_REST}

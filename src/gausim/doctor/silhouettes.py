@@ -1,18 +1,24 @@
 """Silhouettes of the rest scene, and their alignment with the masks."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Shaped
+from torch import Tensor
 
 from gausim.core import Cameras, GaussianScene
+from gausim.ops.triangulation import centroids
+from gausim.ops.visual_hull import project
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw_still
 
 # Smoothing [pixels], steps and precision of the alignment (cv2.findTransformECC).
 _SMOOTHING, _STEPS, _PRECISION = 5, 100, 1e-5
+# Cameras among which a displaced one stands out, so that the place of a free body is measured without it.
+_ENOUGH = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +42,34 @@ class Fit:
     degrees: float  # rotation of the camera that would explain it
 
 
-def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
-    """Renders the rest scene's foreground."""
-    shown = scene.select(scene.foreground)
-    drawn = draw_still(CpuRenderer(), shown, cameras)
+def draw_silhouettes(
+    scene: GaussianScene, cameras: Cameras, at: Float[np.ndarray, "V h w"] | None = None
+) -> Silhouettes:
+    """Renders the rest scene's foreground; with masks ``at``, a free body's, moved to where these are."""
+    shown, renderer = scene.select(scene.foreground), CpuRenderer()
+    if at is not None:
+        place = centroids(torch.from_numpy(at)[None].double(), cameras)[0]
+        shown = replace(shown, means=shown.means + (place - shown.means.double().mean(0)).float())
+        way = _way(draw_still(renderer, shown, cameras).alpha[0], torch.from_numpy(at), cameras)
+        shown = replace(shown, means=shown.means + way.float())
+    drawn = draw_still(renderer, shown, cameras)
     return Silhouettes(drawn.alpha[0].clamp(0, 1).numpy(), drawn.rgb[0].clamp(0, 1).numpy())
+
+
+def _way(drawn: Float[Tensor, "V h w"], masks: Float[Tensor, "V h w"], cameras: Cameras) -> Float[Tensor, " 3"]:
+    """Translation of a body that brings its silhouettes to the masks, by all cameras but the one that fits worst."""
+    views = range(len(masks))
+    ways = []
+    for left in views if len(views) >= _ENOUGH else (-1,):
+        kept = [v for v in views if v != left]
+        some, silhouettes = cameras.select(kept), torch.stack((drawn[kept], masks[kept])).double()
+        ends = centroids(silhouettes, some)
+        seen = torch.from_numpy(centres(silhouettes.numpy()))
+        pixels = project(ends, some.viewmats.double(), some.Ks.double())[0]
+        ways.append(
+            (float(((pixels[:, 1] - pixels[:, 0]) - (seen[1] - seen[0])).norm(dim=-1).max()), ends[1] - ends[0])
+        )
+    return min(ways, key=lambda way: way[0])[1]
 
 
 def overlap(a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"]) -> float:
