@@ -20,7 +20,7 @@ SIZES = {
 }
 # Edge lengths of the levels, coarse to fine, and the level of kernels without hierarchy [fractions of the diagonal].
 EDGE_LENGTHS, KERNEL_LEVEL = (2.0, 0.4), "hierarchy.levels=[{diameter:0.0,edge_length:0.1}]"
-MODELS = ("gausim_elastic", "gausim")
+MODELS = ("gausim_network", "gausim")
 PAPER_RATIO = "with hierarchy (the paper: 2.8 in time, 1.7 in memory, rendering included)"
 
 

@@ -17,7 +17,7 @@ from gausim.training.module import GausSimModule
 
 SEQUENCES = 4  # of an optimiser step, at most
 SLOW_ROUNDS = 2  # timed steps of plain torch
-OVERRIDES, RIVAL = ("data=demo", "model=gausim"), "model=gausim_elastic"
+OVERRIDES, RIVAL = ("data=demo", "model=gausim"), "model=gausim_network"
 
 
 def run(options: Options, overrides: Sequence[str] = ()) -> list[Row]:

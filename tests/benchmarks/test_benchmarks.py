@@ -17,7 +17,7 @@ from gausim.core import GaussianScene
 from gausim.data.datamodule import ReadyDataModule
 from gausim.losses import Objective
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
@@ -44,7 +44,7 @@ def test_every_case_gives_finite_figures(case, first_call: None) -> None:
 
 
 def _module(scenes: list[GaussianScene]) -> GausSimModule:
-    template = partial(ElasticTemplate, modes=6, neighbours=6)
+    template = partial(MaterialTemplate, modes=6)
     model = gausim(scenes, [24.0], template=template, radii=(0.3, 0.7), edges="rest", hidden=8, layers=1)
     method = SharedSimulator(model, ModalInitialStates(model, (0, 0)), (0, 0))
     return GausSimModule(method=method, renderer=CpuRenderer(threads=1), objective=Objective())

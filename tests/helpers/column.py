@@ -8,7 +8,7 @@ from gausim.interaction.interaction import Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 from helpers import bodies
 
 
@@ -17,7 +17,7 @@ def make_column(count: int = 90) -> GaussianScene:
 
 
 def make_simulator(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
-    settings = {"template": partial(ElasticTemplate, modes=8), "output_scale": 0.01, "anchor": True}
+    settings = {"template": partial(MaterialTemplate, modes=8), "output_scale": 0.01, "anchor": True}
     return bodies.make_model(scene, seed=seed, energy_guard_frames=passive, **settings)
 
 

@@ -11,7 +11,7 @@ from gausim.core import SimState
 from gausim.data.objects import ObjectData
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 from gausim.render.reference import ReferenceRenderer
 from helpers import toy_object
 from helpers.simulators import gausim
@@ -37,7 +37,7 @@ def played_run(folder: Path) -> LoadedRun:
     """Two sequences of one object; the network has random weights, the template a firm block."""
     toy = toy_object.write_toy_object(folder / "data" / "toy")
     torch.manual_seed(0)
-    template = partial(ElasticTemplate, modes=6, geometric=1.0)
+    template = partial(MaterialTemplate, modes=6)
     model = gausim(
         [toy.scene], [toy.fps], radii=(0.3, 0.7), graph_radii=(0.9, 0.5), max_neighbours=6, hidden=8, layers=1,
         template=template, output_scale=0.005, energy_guard_frames=6,

@@ -46,7 +46,7 @@ def samples(count: int, steps: int, dtype: torch.dtype) -> list[SequenceSample]:
 def train(options: dict[str, Any]) -> dict[str, Any]:
     """Optimiser steps on the union of ``count`` sequences: gradients of the last one, weights, numbers."""
     ranks, dtype = Ranks(), getattr(torch, options.get("dtype", "float32"))
-    terms = {"static_weight": 1.0, "momentum_weight": 1.0, "mixing_weight": 0.0, "backprop_steps": 1}
+    terms = {"static_weight": 1.0, "momentum_weight": 1.0, "backprop_steps": 1}
     objective = Objective(**{**terms, **options.get("objective", {})})
     module = real_module(objective, dtype, OptimizerSettings(torch.optim.Adam, clip_per_group=False, decay={}))
     with torch.no_grad():

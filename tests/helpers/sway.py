@@ -14,7 +14,7 @@ from gausim.core import Frame, GaussianScene, Rendered, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
@@ -116,7 +116,7 @@ def cast(record: Any, dtype: torch.dtype) -> Any:
     return replace(record, **floats)
 
 
-ELASTIC = partial(ElasticTemplate, modes=6, neighbours=6)
+ELASTIC = partial(MaterialTemplate, modes=6)
 
 
 def real_module(

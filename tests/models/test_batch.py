@@ -8,14 +8,14 @@ from helpers.bodies import NEURAL, join_states, make_model, make_scene, make_sta
 
 from gausim.models.hierarchy.batch import exact_edges, fixed_edges
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 from gausim.ops.covariance import kernel_volumes
 from gausim.ops.neighbours import radius_edges
 
 PAPER = {"output_scale": 2.0}
 CASES = {
     "hierarchy": PAPER, "kernels under the top": PAPER | {"predicted_levels": (2, 0), "graph_radii": (0.8, 0.3)},
-    "elastic": PAPER | {"template": partial(ElasticTemplate, modes=5, neighbours=6)}, "neural": NEURAL,
+    "elastic": PAPER | {"template": partial(MaterialTemplate, modes=5)}, "neural": NEURAL,
 }  # fmt: skip
 
 

@@ -13,11 +13,10 @@ from gausim.core import ConfigError, SimState
 from gausim.models.rollout.cuda_graph import GraphedStep, StepFunction
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
-from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.material import MaterialTemplate
 from gausim.models.template.template import RestTemplate
 
-ELASTIC = partial(ElasticTemplate, modes=8, neighbours=6)
+ELASTIC = partial(MaterialTemplate, modes=8)
 MATERIAL = partial(MaterialTemplate, modes=8)
 CASES = pytest.mark.parametrize(("template", "edges"), [(ELASTIC, "rest"), (MATERIAL, "rest"), (RestTemplate, "union")])
 

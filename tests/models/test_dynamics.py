@@ -12,7 +12,7 @@ from gausim.core.surroundings import Surroundings
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
-from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
 
 
 def test_offers_the_protocol_and_rolls_out_what_steps_give() -> None:
@@ -148,7 +148,7 @@ FRAMES = 10
 
 def _model(scene: GaussianScene, *, frames: int = FRAMES, scale: float = 0.05) -> GausSim:
     """A network with random weights of a size that feeds the motion of an elastic template."""
-    template = partial(ElasticTemplate, modes=8, geometric=1.0)
+    template = partial(MaterialTemplate, modes=8)
     return make_model(scene, template=template, output_scale=scale, energy_guard_frames=frames).eval()
 
 

@@ -105,6 +105,21 @@ def test_springs_add_their_stiffness_and_no_mass(hierarchy) -> None:
     assert len(found.springs) == ends.shape[1] > 0
 
 
+def test_only_nets_have_matrices_of_their_own_and_are_above_their_springs(hierarchy) -> None:
+    assert not _template(hierarchy).nets
+    net, material = _template(replace(hierarchy, law="springs")), _material(hierarchy)
+    even, stretch = net.matrices(0, *material, 1 / 24), net.body(0).stretch
+    net.nets["0"].normal_(generator=torch.Generator().manual_seed(5))
+    found, (between, moved) = net.matrices(0, *material, 1 / 24), torch.eye(9).double() + 0.3 * net.nets["0"]
+    springs = stretch.mT @ (found.springs[:, None] * stretch)
+    root = torch.linalg.cholesky(even.stiffness - springs) @ between
+    torch.testing.assert_close(found.stiffness - springs, root @ root.mT, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(found.mass, moved.mT @ even.mass @ moved)
+    assert float(torch.linalg.eigvalsh(found.stiffness - springs)[0]) > 0
+    torch.testing.assert_close(found.damping, 0.02 * found.stiffness)
+    assert net.own(0, "template.") == ("template.nets.0",)
+
+
 def _masses(body, density):
     rho = (2.5 * torch.tanh(density / 2.5)).exp()
     return torch.einsum("n,nal,nam->lm", rho, body.inertia, body.inertia)

@@ -38,7 +38,6 @@ MODES = "model.simulator.template.modes=6"
 WARM = [MODES, "plan.warm_start.updates=60"]
 CHOICES = [
     ["model=gausim", *WARM],
-    pytest.param(["model=gausim_elastic", *WARM], marks=pytest.mark.slow),
     pytest.param(["model=gausim", *WARM, "supervision=points"], marks=pytest.mark.slow),
     ["model=gausim_network", "plan.teach.shows=2", "plan.teach.rolls=2"],
 ]

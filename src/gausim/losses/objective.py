@@ -48,8 +48,6 @@ class Objective:
         momentum_weight: weight of the momentum loss [(total mass x diagonals)^2], times the rest state's loss.
         backprop_steps: loss gradients stop after this number of steps; 0 lets them through the whole rollout.
         energy: the loss on energy gained by free motion.
-        mixing_weight: weight of the penalty on mode mixing (squares of the template's mixing matrices), times the rest
-            state's loss; it keeps the initial modes where the frames do not determine them.
         explosion: distance from rest of a kernel [diagonals of the scene's bounding box] at which a rollout ends, with
             no loss beyond it; the log counts these rollouts.
     """
@@ -61,7 +59,6 @@ class Objective:
     momentum_weight: float = 1.5e4
     backprop_steps: int = 0
     energy: EnergyLoss = field(default_factory=EnergyLoss)
-    mixing_weight: float = 0.01
     explosion: float = 3.0
 
     def __post_init__(self) -> None:

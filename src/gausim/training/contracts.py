@@ -25,7 +25,7 @@ class Simulator(Protocol):
     """Dynamics of a batch of sequences, as a torch module.
 
     Training uses these members of :class:`gausim.models.step.scene_model.SceneModel` where a model has them: the units
-    of its kernels (``units_of_kernels``), an energy (``knows_energy``, ``energy``) and its template's ``mixing``.
+    of its kernels (``units_of_kernels``) and an energy (``knows_energy``, ``energy``).
     """
 
     scenes: Sequence[GaussianScene]  # the rest scenes; their index is the ``scene_id`` of samples

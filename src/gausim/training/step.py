@@ -12,7 +12,6 @@ from gausim.training.learner import Learner
 from gausim.training.ranks.ranks import interleave
 from gausim.training.rollout import States, after, describe, explodes, windows
 from gausim.training.statistics import Measured, Statistics
-from gausim.training.terms.mixing import mixing_term
 from gausim.training.terms.rest import rest_term
 from gausim.training.terms.term import StepInputs
 
@@ -46,8 +45,7 @@ class OptimiserStep(Learner):
             self.simulator, samples, whole, draws, statistics, self.ranks, self.accumulate, self.rest_loss,
             self.objective, self.images, self.diagonals,
         )  # fmt: skip
-        for term in (rest_term, mixing_term):
-            term(inputs)
+        rest_term(inputs)
         self.exchange.step([p for p in self.parameters() if p.requires_grad])
         stats = self._stats(samples, whole, statistics.fetch(self.settings.clip(optimizer)))
         self.exchange.absorb()

@@ -177,10 +177,6 @@ class SceneModel(nn.Module, ABC):
         """Energy that the template's damping takes in a step that ends with ``after`` and began at x_{t-1}."""
         return prepared.template.dissipated(_finest(prepared, after), prepared.finest(previous))
 
-    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """Mode mixing of the template of a scene (:meth:`Template.mixing`); None where it has none."""
-        return self.template.mixing(scene_id)
-
     def smooth_motions(self, scene_id: int) -> SmoothMotions:
         """The template's modes at every kernel of a scene.
 

@@ -16,6 +16,10 @@ damping. These factors give, in modal coordinates z,
     C = 2 sum_i t_i rho_i M_i                              drag, with t_i = tanh(c_0 e^{d_i} / 2)
     D = C + (tr C / (4 tr M) + c_1) K                      damping
 
+A net is no solid, and no field of material in a solid says how it holds together. So of a net of springs the part of K
+that is the cells', R R^T, becomes R (1 + 0.3 W) (1 + 0.3 W)^T R^T, and M becomes H^T M H, H = 1 + 0.3 W', with W and W'
+trained for each scene. K stays above the linear part of the springs' forces, so that the potential energy is positive.
+
 k, c_0, c_1 and the resistance to growth are trained numbers common to all scenes. In a step of the trapezoidal rule an
 even drag c_0 reduces the amplitudes of all modes, the fastest included, by exp(-c_0 / 2): that is what the tanh and the
 first part of the factor of K are for. With D = c_0 M, modes too fast for the frame rate would hardly be damped, and
@@ -62,6 +66,8 @@ FASTEST = 4 * math.pi
 # damping is smaller: as long as a body's periods are wrong, strong damping fits best, and training is slow to reduce it
 # again.
 GAIN, DAMPING_GAIN, GROWTH_GAIN = 10.0, 0.5, 2.0
+# Gain of W and W', and part of the mean stiffness that is added for its Cholesky factor.
+MIXING_GAIN, LEAST_STIFF = 0.3, 1e-6
 # Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
 
@@ -166,6 +172,8 @@ class MaterialTemplate(Template):
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.damping = nn.Parameter(torch.zeros(2))
         self.growth = nn.Parameter(torch.zeros(()))
+        nets = {str(i): len(self.body(i).values) for i, law in enumerate(self.laws) if law == "springs"}
+        self.nets = nn.ParameterDict({i: torch.zeros(2, count, count) for i, count in nets.items()})
         self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 1))
 
@@ -230,9 +238,11 @@ class MaterialTemplate(Template):
         drag, viscosity, growth = self._damping(scene_id)
         cells = units[:, :2]
         stiffness = torch.einsum("np,pnlm->lm", cells, body.stiffness)
-        stiffness = k * (stiffness + body.stretch.mT @ (springs[:, None] * body.stretch))
         density = _saturated(log_density).exp()
         mass, dragged = _inertia(body, density, (drag * frame * units[:, 2]).div(2).tanh())
+        if str(scene_id) in self.nets:
+            stiffness, mass = self._of_net(scene_id, stiffness, mass)
+        stiffness = k * (stiffness + body.stretch.mT @ (springs[:, None] * body.stretch))
         rate = _trace(dragged) / _trace(mass)
         viscous = rate / 4 + viscosity / frame
         inertia, damping = mass, dragged + viscous * stiffness
@@ -243,6 +253,15 @@ class MaterialTemplate(Template):
             stiffness, mass, inertia, damping, k * cells, k * springs, density, k * (cells - 1), k * (springs - 1),
             growth / frame, viscous, rate,
         )  # fmt: skip
+
+    def _of_net(
+        self, scene_id: int, cells: Float[Tensor, "M M"], mass: Float[Tensor, "M M"]
+    ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "M M"]]:
+        """The cells' part of K and M of a net of springs from those of a solid."""
+        one = torch.eye(len(mass), dtype=mass.dtype, device=mass.device)
+        between, moved = one + MIXING_GAIN * self.nets[str(scene_id)]
+        root = torch.linalg.cholesky_ex(cells + LEAST_STIFF * _trace(cells) / len(one) * one)[0] @ between
+        return root @ root.mT, moved.mT @ mass @ moved
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, density and, where there is drag, damping of the units as they enter K, M and D.
@@ -280,6 +299,10 @@ class MaterialTemplate(Template):
     def shared(self, prefix: str) -> tuple[str, ...]:
         """Prefixes of the names of the decoders, of k, of the dampings and of the resistance to growth."""
         return tuple(prefix + name for name in ("stiffness", "damping", "growth", "unit_decoder.", "link_decoder."))
+
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """The name of W and W' of a net of springs; a solid has none."""
+        return (f"{prefix}nets.{scene_id}",)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
@@ -344,9 +367,10 @@ class PreparedMaterial(ModalScene):
         And that of the strain of the reference, which is static for a homogeneous body: of the stiffness beyond it.
         """
         acceleration, strain = load.split((3, 9), -1)
-        own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
-        if self.body.springs is not None:
-            own = own + self.body.springs.pull(strain, self.matrices.tense)
+        if self.body.springs is None:
+            own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
+        else:
+            own = super().force(load) + self.body.springs.pull(strain, self.matrices.tense)
         return own + force_of_strain(strain, self.matrices.uneven, self.body.strain)
 
     def correction_unit(self) -> Float[Tensor, ""]:

@@ -10,9 +10,6 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-# Fraction of a spring's stiffness that acts across its direction: central forces alone leave soft mechanisms.
-TRANSVERSE_STIFFNESS = 0.3
-
 
 def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
     """Distinct pairs (E, 2) of points (N, 3), of which one is among the other's nearest neighbours."""
@@ -142,18 +139,3 @@ class Springs(nn.Module):
 
 def _tension(first: Stretched, second: Stretched, damping: Tensor | float) -> Tensor:
     return (first.stretch + second.stretch) / 2 + damping * (second.stretch - first.stretch)
-
-
-def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
-    """Springs between neighbouring units, k ~ 1 / length^2, scaled to eigenvalue 1 of the first mode.
-
-    The eigenvalue includes the transverse stiffness, :data:`TRANSVERSE_STIFFNESS`.
-    """
-    pairs = neighbour_pairs(rest, neighbours)
-    offset, difference = rest[pairs[:, 1]] - rest[pairs[:, 0]], phi[pairs[:, 1]] - phi[pairs[:, 0]]
-    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
-    outer = offset[:, :, None] * offset[:, None, :] / length**2
-    blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
-    first = difference[:, :, 0]
-    lowest = np.einsum("ea,eab,eb->", first, blocks, first)
-    return Springs(pairs.T, rest, phi, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))

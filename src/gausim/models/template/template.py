@@ -2,7 +2,7 @@
 
 The recursion of METHOD section 2 deforms a template: x_i = x_p + C_i (T_i - T_p), where C_i accumulates the network's
 deformation gradients. In the paper the template is the rest state. A dynamic template
-(:mod:`gausim.models.template.elastic`) predicts the next frame by itself; the network then predicts a correction, and
+(:mod:`gausim.models.template.material`) predicts the next frame by itself; the network then predicts a correction, and
 zero output continues the motion instead of returning to rest.
 """
 
@@ -129,10 +129,6 @@ class Template(nn.Module, ABC):
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Learned properties of the scene's units by name: ``density``, and ``stiffness`` and ``damping`` if known."""
         return {"density": Property(units.log_density.exp(), DENSITY)}
-
-    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """Differentiable measure of the mode mixing relative to the initial body; None for templates without it."""
-        return None
 
     def shared(self, prefix: str) -> tuple[str, ...]:
         """Prefixes of the names of the parameters that all scenes have in common, each after ``prefix``."""

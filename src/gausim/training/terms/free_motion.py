@@ -77,7 +77,7 @@ class FreeMotion:
             name = type(getattr(model, "template", model)).__name__
             raise ConfigError(
                 f"loss.energy.weight is {weight}, but {name} knows no energy. Use a template that does "
-                "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
+                "(gausim.models.template.material.MaterialTemplate), or set it to 0 or null."
             )
         self.weight = float(knows) if weight is None else float(weight)
         self._model, self._settings, self._graphs = model, objective.energy, graphs
