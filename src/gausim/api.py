@@ -7,8 +7,6 @@ image = sim.render("cam_0")  # (H, W, 3) uint8
 sim.save_session("push.json")
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,7 +105,7 @@ class Simulation:
 
     def render(
         self, camera: str | float | Cameras | None = None, *, background: tuple[float, float, float] | None = None
-    ) -> np.ndarray:
+    ) -> "np.ndarray":
         """Renders the latest frame, (H, W, 3) uint8.
 
         Args:

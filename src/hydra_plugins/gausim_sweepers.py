@@ -1,7 +1,5 @@
 """The sweeper for Hydra, which searches this namespace. Every Hydra program loads this file, so it imports lazily."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

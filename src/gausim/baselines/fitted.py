@@ -1,7 +1,5 @@
 """Base of the methods that are fitted per sequence, the static method, and their dynamics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypedDict, TypeVar
@@ -28,7 +26,7 @@ class FittedState:
     # further variables of the method that the next frame needs (anchors, particles, fields)
     inner: tuple[Tensor, ...] = ()
 
-    def detach(self) -> FittedState:
+    def detach(self) -> "FittedState":
         """The same values, detached from the graph of loss gradients."""
         return replace(
             self,
@@ -154,7 +152,7 @@ class FittedDynamics:
             raise _no_forces(self.method)
         return roll_out(self.stepper(initial), steps)
 
-    def stepper(self, initial: SimState) -> FittedStepper:
+    def stepper(self, initial: SimState) -> "FittedStepper":
         """Stepper at frame 0; of ``initial`` only the positions are used, and nothing of a free body."""
         return FittedStepper(self.method, self.sequence_id, initial)
 

@@ -1,7 +1,5 @@
 """`gausim adapt RUN`: fit the initial states of new sequences with the trained simulator of a run frozen."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from collections.abc import Sequence
@@ -148,7 +146,7 @@ def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> l
     return [_entry(item.root, known[item.name]) for item in found]
 
 
-def _entry(root: Path, trained: ObjectData) -> dict[str, Any]:
+def _entry(root: Path, trained: "ObjectData") -> dict[str, Any]:
     paths = {"root": root, "scene": trained.scene_path, "masks": trained.masks_path}
     placed = {key: None if path is None else str(Path(path).resolve()) for key, path in paths.items()}
     test = trained.test if Path(root).resolve() == trained.root.resolve() else None  # it names sequences of that store

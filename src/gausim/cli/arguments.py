@@ -1,7 +1,5 @@
 """Options that several commands share, each with one spelling and one meaning."""
 
-from __future__ import annotations
-
 import argparse
 from functools import reduce
 from operator import or_
@@ -77,7 +75,7 @@ def add_pin_option(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def pinned_by(scene: GaussianScene, sides: list[str], *, below_z: float | None = None) -> GaussianScene:
+def pinned_by(scene: "GaussianScene", sides: list[str], *, below_z: float | None = None) -> "GaussianScene":
     """The scene with its pins replaced by the union of the sides of ``--pin``, else by those below a height."""
     from gausim.ops.selection import Selection, apply_masks, parse_half_space
 
@@ -95,7 +93,7 @@ def positive(text: str) -> int:
     return value
 
 
-def parse_background(text: str) -> Tensor | None:
+def parse_background(text: str) -> "Tensor | None":
     """Reads a background colour; None is black.
 
     Raises:

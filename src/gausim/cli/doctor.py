@@ -1,7 +1,5 @@
 """`gausim doctor`: faults of a data set and their remedies, to be used before a training."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -78,7 +76,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
 
-def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | None:
+def _scene(data: "ObjectData", arguments: argparse.Namespace) -> "GaussianScene | None":
     """The rest scene with the requested pins; None if the object has no scene yet."""
     from gausim.io.ply import load_scene
 

@@ -1,7 +1,5 @@
 """`gausim inspect`: statistics of a scene and of its hierarchy."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from pathlib import Path
@@ -69,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
+def _marked(scene: "GaussianScene", arguments: argparse.Namespace) -> "GaussianScene":
     from gausim.ops.selection import apply_masks, parse_half_space
 
     for side in arguments.simulate:
@@ -77,7 +75,7 @@ def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScen
     return pinned_by(scene, arguments.pin)
 
 
-def _print_scene(scene: GaussianScene) -> None:
+def _print_scene(scene: "GaussianScene") -> None:
     low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
     print(f"scene      {scene.name}\nkernels    {scene.count}\nSH degree  {scene.sh_degree}")
     print("box        " + "  ".join(f"{a} {low[i]:.4g} .. {high[i]:.4g}" for i, a in enumerate("xyz")))
@@ -88,7 +86,7 @@ def _print_scene(scene: GaussianScene) -> None:
     print(f"volume     c = {scene.volume_scale:.6g} (V = prod of c s_i)")
 
 
-def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
+def _print_hierarchy(hierarchy: "Hierarchy", radii: list[float]) -> None:
     levels = hierarchy.levels
     print("level      units   free  pinned  max diameter    volume sum      mass sum at density 1")
     for number, level in enumerate(levels):
@@ -103,7 +101,7 @@ def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
     print("levels     " + " -> ".join(str(level.count) for level in levels))
 
 
-def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namespace, out: Path) -> None:
+def _draw(scene: "GaussianScene", hierarchy: "Hierarchy", arguments: argparse.Namespace, out: Path) -> None:
     from gausim.pictures.kernels import draw_clusters
 
     above = range(1, len(hierarchy.levels))

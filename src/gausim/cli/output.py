@@ -1,7 +1,5 @@
 """Output of commands: progress bars, and final sentences on the result with one address and the next commands."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import sys
@@ -19,7 +17,7 @@ PUSH = "--force on=tip weights=3 direction=x"
 OWN_OBJECT = ("train", "data=DIRECTORY")
 
 
-def bars(*columns: ProgressColumn) -> Progress:
+def bars(*columns: "ProgressColumn") -> "Progress":
     """A context manager that shows tasks with name, bar and the given columns; by default counts and time."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn

@@ -1,7 +1,5 @@
 """`gausim report DIR…`: tables, figures and videos of runs and sweeps, as one page and as files for papers."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path
@@ -55,7 +53,7 @@ def _write_record(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _next(report: Report) -> list[list[object]]:
+def _next(report: "Report") -> list[list[object]]:
     """Next commands for the best run, or without evaluations the commands that evaluate runs."""
     from gausim.report.runs import NOT_EVALUATED
 

@@ -1,7 +1,5 @@
 """`gausim train`: learn an object's dynamics from multi-view videos."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -27,7 +25,7 @@ again, it resumes from its last checkpoint; once finished it is refused, unless 
 started again leaves out what is finished, resumes what is not, and tries again what failed if retry_failed=true."""
 
 
-def train(cfg: DictConfig) -> object:
+def train(cfg: "DictConfig") -> object:
     """One job of Hydra, which loads torch only when it begins; in a sweep returns what became of it.
 
     In a sweep errors do not stop the other jobs: they are logged and repeated in the summary at the end.

@@ -1,7 +1,5 @@
 """`gausim view RUN|SCENE`: interactive simulation of an object in the browser."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
@@ -88,7 +86,7 @@ def _scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     return group
 
 
-def _subject(arguments: argparse.Namespace) -> Subject:
+def _subject(arguments: argparse.Namespace) -> "Subject":
     from gausim.cli.view_subject import run_subject, scene_subject
 
     if not arguments.what.is_dir():

@@ -1,7 +1,5 @@
 """Calibrated pinhole cameras, OpenCV convention."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +22,7 @@ class Cameras:
     height: int  # image height [pixels]
     names: tuple[str, ...]  # one name per view, as in the data set
 
-    def validated(self, source: str) -> Cameras:
+    def validated(self, source: str) -> "Cameras":
         """Returns itself, or raises :class:`DataError` naming ``source`` and the camera with an invalid pose."""
         r = self.viewmats[:, :3, :3].double()
         error = (r @ r.mT - torch.eye(3, dtype=r.dtype)).abs().amax((-1, -2))
@@ -45,12 +43,12 @@ class Cameras:
         r, t = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
         return -(r.mT @ t[..., None])[..., 0]
 
-    def select(self, index: list[int]) -> Cameras:
+    def select(self, index: list[int]) -> "Cameras":
         """The cameras at these indices, in that order."""
         return Cameras(
             self.viewmats[index], self.Ks[index], self.width, self.height, tuple(self.names[i] for i in index)
         )
 
-    def to(self, device: torch.device | str) -> Cameras:
+    def to(self, device: torch.device | str) -> "Cameras":
         """The same cameras on another device."""
         return Cameras(self.viewmats.to(device), self.Ks.to(device), self.width, self.height, self.names)

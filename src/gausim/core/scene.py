@@ -1,7 +1,5 @@
 """The rest scene: 3D Gaussians with masks of simulated, pinned and foreground kernels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 
 import torch
@@ -51,7 +49,7 @@ class GaussianScene:
         foreground: Tensor | None = None,
         volume_scale: float | None = None,
         name: str = "scene",
-    ) -> GaussianScene:
+    ) -> "GaussianScene":
         """Builds a scene; masks default to all simulated, none pinned, all foreground.
 
         The default ``volume_scale`` makes the mean kernel volume, and with unit density the mean mass, 1.
@@ -90,7 +88,7 @@ class GaussianScene:
         x = self.means[self.simulated]
         return float((x.amax(0) - x.amin(0)).norm())
 
-    def validated(self) -> GaussianScene:
+    def validated(self) -> "GaussianScene":
         """Returns itself, or raises :class:`SceneError` naming the field that is wrong."""
         if self.count == 0:
             raise SceneError(f"{self.name}: expected at least one Gaussian, got none.")
@@ -116,11 +114,11 @@ class GaussianScene:
             raise SceneError(f"{self.name}: mask 'pinned' marks kernels that mask 'simulated' leaves out.")
         return self
 
-    def select(self, mask: Bool[Tensor, " K"]) -> GaussianScene:
+    def select(self, mask: Bool[Tensor, " K"]) -> "GaussianScene":
         """The sub-scene of the kernels where ``mask`` holds, in the same order."""
         return replace(self, **{n: x[mask] for n in self._tensor_names() if (x := getattr(self, n)) is not None})
 
-    def to(self, device: torch.device | str) -> GaussianScene:
+    def to(self, device: torch.device | str) -> "GaussianScene":
         """The same scene on another device."""
         return replace(self, **{n: x.to(device) for n in self._tensor_names() if (x := getattr(self, n)) is not None})
 

@@ -1,7 +1,5 @@
 """States (the input of a step), trajectories (the output of a rollout), and smooth motions without any dynamics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -19,11 +17,11 @@ class SimState:
     previous: Float[Tensor, "K 3"]  # x_{t-1}, one frame earlier
     older: tuple[Float[Tensor, "K 3"], ...] = ()  # x_{t-2}, x_{t-3}, ..., where they are known
 
-    def detach(self) -> SimState:
+    def detach(self) -> "SimState":
         """The same values, detached from the graph of loss gradients."""
         return SimState(self.positions.detach(), self.previous.detach(), tuple(x.detach() for x in self.older))
 
-    def remembering(self, count: int) -> SimState:
+    def remembering(self, count: int) -> "SimState":
         """The state with ``count`` older frames; those that are not known continue the motion backwards evenly."""
         older, last, step = list(self.older[:count]), self.previous, self.positions - self.previous
         if older:
@@ -56,14 +54,14 @@ class Trajectory:
         """Number of frames F, the initial state included."""
         return self.positions.shape[0]
 
-    def to(self, device: torch.device | str) -> Trajectory:
+    def to(self, device: torch.device | str) -> "Trajectory":
         """The same on a device."""
         return Trajectory(
             self.positions.to(device), self.deformation_gradients.to(device), self.rotations.to(device),
             self.unit_of_kernel.to(device), self.fps,
         )  # fmt: skip
 
-    def part(self, frames: slice) -> Trajectory:
+    def part(self, frames: slice) -> "Trajectory":
         """The chosen frames."""
         states = self.positions[frames], self.deformation_gradients[frames], self.rotations[frames]
         return Trajectory(*states, self.unit_of_kernel, self.fps / (frames.step or 1))
@@ -103,7 +101,7 @@ class SmoothMotions:
         identity = torch.eye(3, dtype=coordinates.dtype, device=coordinates.device)
         return identity + torch.einsum("nijm,bm->bnij", self.displacement_gradients, coordinates)
 
-    def to(self, like: Tensor) -> SmoothMotions:
+    def to(self, like: Tensor) -> "SmoothMotions":
         """The same motions with the data type and device of ``like``."""
         kernels, gradients, sizes = (x.to(like) for x in (self.kernels, self.displacement_gradients, self.sizes))
         return SmoothMotions(kernels, gradients, self.unit_of_kernel.to(like.device), sizes)

@@ -1,7 +1,5 @@
 """What acts on a body besides its own elasticity: gravity, a floor, and hands that move its pins."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -59,7 +57,7 @@ class HandPose:
         turned = (self.rotations.index_select(0, hand) @ offset[..., None])[..., 0]
         return self.centres.index_select(0, hand) + turned
 
-    def to(self, like: Tensor) -> HandPose:
+    def to(self, like: Tensor) -> "HandPose":
         """The same pose on the device and in the precision of a tensor."""
         return HandPose(self.rotations.to(like), self.origins.to(like), self.centres.to(like))
 
@@ -72,7 +70,7 @@ class HandPath:
     centres: Float[Tensor, "F G 3"]  # [scene units]
 
     @staticmethod
-    def of(points: Float[Tensor, "F C 3"], hand: Int[Tensor, " C"]) -> HandPath:
+    def of(points: Float[Tensor, "F C 3"], hand: Int[Tensor, " C"]) -> "HandPath":
         """The best rigid motion (Kabsch) of each hand's points; a translation where they fix no rotation.
 
         Raises:

@@ -1,7 +1,5 @@
 """Samples for training: frames 0..T of one sequence in 8 bits, with their cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -61,7 +59,7 @@ class SequenceSample:
             self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps, self.start
         )
 
-    def to(self, device: torch.device | str) -> SequenceSample:
+    def to(self, device: torch.device | str) -> "SequenceSample":
         """The same sample on another device (Lightning moves batches through this)."""
         return replace(self, frames=self.frames.to(device, non_blocking=True), cameras=self.cameras.to(device))
 

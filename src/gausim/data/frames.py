@@ -1,7 +1,5 @@
 """Sources of the frames of a sequence: image files or packed frames."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -24,7 +22,7 @@ POSE_TOLERANCE = 1e-5
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mts")
 
 
-def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | ImageSource:
+def open_frames(root: Path, views: Sequence[str], fps: float) -> "PackedSource | ImageSource":
     """The frames of a sequence's folder, cameras in the order of ``views``; only headers are read.
 
     Raises:

@@ -1,7 +1,5 @@
 """Training order: a pure function of seed and epoch, with a position from which a resumed run continues."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
@@ -78,7 +76,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         return dealt if epoch == self.epoch else 0
 
     @property
-    def sampler(self) -> SequenceBatchSampler:
+    def sampler(self) -> "SequenceBatchSampler":
         """The object itself; Lightning calls its ``set_epoch``."""
         return self
 

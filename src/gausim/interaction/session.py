@@ -4,8 +4,6 @@ JSON, one event a line. Forces are multiples of the weight of the part that they
 ``gravity`` of the header; frames count steps since the session began.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -153,7 +151,7 @@ class MadeWith(Checked, frozen=True):
         name: str = "rest",
         run: str = "",
         path: HandPath | None = None,
-    ) -> MadeWith:
+    ) -> "MadeWith":
         """Hashes the inputs of a simulation: the rest scene, the method and the initial state called ``name``.
 
         A method is identified by its type, by its state dict if it is a torch module, and by ``settings``, a text of

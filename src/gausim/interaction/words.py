@@ -1,7 +1,5 @@
 """Command-line syntax of forces: `--force on=tip weights=3 direction=x frames=12`."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -58,7 +56,7 @@ def has_forces(arguments: argparse.Namespace) -> bool:
     return any(getattr(arguments, kind) for kind in _HELP)
 
 
-def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entry]:
+def entries_of(arguments: argparse.Namespace, scene: "GaussianScene") -> "list[Entry]":
     """The events of the command line, sorted by time; distinct names let all forces act at the same time.
 
     Raises:
@@ -69,7 +67,7 @@ def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entr
     return sorted(entries, key=lambda entry: entry.at)
 
 
-def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str = "force") -> Entry:
+def entry_of(kind: str, words: Sequence[str], scene: "GaussianScene", *, name: str = "force") -> "Entry":
     """One event of the command line; ``name`` is used for forces.
 
     Raises:
@@ -101,7 +99,7 @@ def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str
         raise ConfigError(f"--{kind} {' '.join(words)}: {error} Expected {_HELP[kind]}.") from error
 
 
-def parse_part(text: str, scene: GaussianScene) -> Selected:
+def parse_part(text: str, scene: "GaussianScene") -> "Selected":
     """Parses a part of an object, see :data:`EPILOG`.
 
     Raises:

@@ -4,8 +4,6 @@ pycolmap does not replace this reader: it reads some truncated files without an 
 count in a file. This reader compares a count with the remaining bytes before it allocates memory.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -66,7 +64,7 @@ class ColmapCamera:
         bent = "FISHEYE" in self.model or self.model == "FOV"
         return bent or bool(self.params[4 if self.model in _TWO_FOCAL else 3 :].any())
 
-    def scaled(self, x: float, y: float) -> ColmapCamera:
+    def scaled(self, x: float, y: float) -> "ColmapCamera":
         """The same camera for images of another size, ``x`` times as wide and ``y`` times as high.
 
         Raises:

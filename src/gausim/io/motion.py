@@ -4,8 +4,6 @@ Every kernel follows exactly one unit, x_k = x_c + G_c (X_k - X_c) with covarian
 centres and deformation gradients are the whole motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,7 +28,7 @@ class UnitMotion:
     unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel
 
     @staticmethod
-    def of(scene: GaussianScene, trajectory: Trajectory) -> UnitMotion:
+    def of(scene: GaussianScene, trajectory: Trajectory) -> "UnitMotion":
         """The units' motion of a trajectory; a kernel that does not follow its unit becomes a unit of its own.
 
         Raises:

@@ -1,7 +1,5 @@
 """Decoding of image files by OpenCV, after checks of declared sizes, which a damaged file may exaggerate."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ def decode(path: Path) -> np.ndarray | None:
         return None
 
 
-def _tiff(image: Image) -> np.ndarray | None:
+def _tiff(image: "Image") -> np.ndarray | None:
     """Pixels of a TIFF as stored; None for other files.
 
     OpenCV multiplies the colours of a TIFF by its alpha, and cannot read one that is to be turned.
@@ -86,7 +84,7 @@ def exif_turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(turns[orientation](pixels)) if orientation in turns else pixels
 
 
-def _has_palette(image: Image) -> bool:
+def _has_palette(image: "Image") -> bool:
     return image.mode == "P" and "transparency" not in image.info
 
 
@@ -108,7 +106,7 @@ def read_header(path: Path) -> ImageHeader | None:
     return _opened(path, _header)
 
 
-def _opened(path: Path, read: Callable[[Image], T]) -> T | None:
+def _opened(path: Path, read: "Callable[[Image], T]") -> T | None:
     """What is read from an image that Pillow has opened but not decoded; None where it raises anything."""
     from PIL import Image
 
@@ -122,7 +120,7 @@ def _opened(path: Path, read: Callable[[Image], T]) -> T | None:
         return None
 
 
-def _header(image: Image) -> ImageHeader:
+def _header(image: "Image") -> ImageHeader:
     tags = image.getexif()
     # Pillow tells the size of a TIFF after the turn.
     swapped = image.format == "TIFF" and tags.get(ORIENTATION) in QUARTER_TURNS
@@ -130,6 +128,6 @@ def _header(image: Image) -> ImageHeader:
     return ImageHeader(width, height, image.mode, {**tags, **tags.get_ifd(_EXIF)})
 
 
-def _is_whole(image: Image) -> bool:
+def _is_whole(image: "Image") -> bool:
     image.verify()  # raises otherwise
     return True

@@ -1,7 +1,5 @@
 """MeshGraphNet: encoder, message-passing processor, decoder (Pfaff et al. 2021)."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn

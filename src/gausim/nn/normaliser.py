@@ -1,7 +1,5 @@
 """Running mean and variance of network inputs, as in MeshGraphNets (Pfaff et al. 2021)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Features of a point from planes of learned features: tri-planes of space, six planes of space and time (HexPlane)."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 

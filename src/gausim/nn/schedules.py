@@ -1,7 +1,5 @@
 """Learning-rate schedules: a factor on the rates by the part of a training that is done."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

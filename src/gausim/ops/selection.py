@@ -1,7 +1,5 @@
 """Selections of kernels by position, combined by ``&``, ``|`` and ``~`` and stored as masks."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -33,15 +31,15 @@ class Selection(ABC):
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
         """True for the kernels that are selected."""
 
-    def __and__(self, other: Selection) -> Selection:
+    def __and__(self, other: "Selection") -> "Selection":
         """Intersection with another selection."""
         return _Made(lambda scene: self(scene) & other(scene))
 
-    def __or__(self, other: Selection) -> Selection:
+    def __or__(self, other: "Selection") -> "Selection":
         """Union with another selection."""
         return _Made(lambda scene: self(scene) | other(scene))
 
-    def __invert__(self) -> Selection:
+    def __invert__(self) -> "Selection":
         """Complement of this selection."""
         return _Made(lambda scene: ~self(scene))
 

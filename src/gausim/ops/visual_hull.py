@@ -1,7 +1,5 @@
 """Visual hull on a voxel grid: the largest body that projects into every foreground mask."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +43,7 @@ class VoxelHull:
         )
         return self.origin + index * self.spacing, functional.normalize(-torch.stack(slope, -1), dim=-1)
 
-    def dilated(self, voxels: int) -> VoxelHull:
+    def dilated(self, voxels: int) -> "VoxelHull":
         """The body grown by this many voxels in every direction."""
         width = 2 * voxels + 1
         body = functional.pad(self.occupied.float()[None, None], (2 * voxels,) * 6)

@@ -1,7 +1,5 @@
 """Static reconstruction: the Gaussians of the rest scene from posed RGBA stills, through any renderer."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -84,7 +82,7 @@ def reconstruct(
     options: ReconstructionOptions,
     *,
     name: str = "scene",
-    progress: Callable[[Reconstruction], None] | None = None,
+    progress: "Callable[[Reconstruction], None] | None" = None,
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 

@@ -1,7 +1,5 @@
 """Images of a static reconstruction for training and measuring: posed RGBA images in sets of one size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +31,7 @@ class ImageSet:
     # first and last step in which training draws from the set [fractions of all steps]
     span: tuple[float, float] = (0.0, 1.0)
 
-    def select(self, index: Sequence[int]) -> ImageSet:
+    def select(self, index: Sequence[int]) -> "ImageSet":
         """The images at these indices."""
         return replace(self, images=self.images[list(index)], cameras=self.cameras.select(list(index)))
 

@@ -1,7 +1,5 @@
 """Images of a deformed scene: covariances, view-dependent colours and the call of a renderer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +27,7 @@ class SceneAppearance:
     index: Int[Tensor, " n"] | None  # indices of the drawn kernels in the scene; None means all
 
     @staticmethod
-    def of(scene: GaussianScene, mask: Bool[Tensor, " K"] | None = None) -> SceneAppearance:
+    def of(scene: GaussianScene, mask: Bool[Tensor, " K"] | None = None) -> "SceneAppearance":
         """The appearance of a scene, or of its kernels where ``mask`` holds (e.g. ``scene.foreground``)."""
         index = None
         if mask is not None and not bool(mask.all()):
@@ -43,7 +41,7 @@ class SceneAppearance:
             index=index,
         )
 
-    def to(self, like: Tensor) -> SceneAppearance:
+    def to(self, like: Tensor) -> "SceneAppearance":
         """The same in the type and on the device of ``like``."""
         if self.covars.dtype == like.dtype and self.covars.device == like.device:
             return self

@@ -1,7 +1,5 @@
 """The training plan: the only place that decides epochs, T, learning-rate factors, the first stages and the end."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -144,7 +142,7 @@ class TrainingPlan:
 
     # ------------------------------------------------------------------------------------------------ resolution
 
-    def resolved(self, data: DataFacts, *, ranks: int = 1) -> TrainingPlan:
+    def resolved(self, data: DataFacts, *, ranks: int = 1) -> "TrainingPlan":
         """The plan for some data, without None in epochs, T and batch size; a resolved plan stays as it is.
 
         Raises:

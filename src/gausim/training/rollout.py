@@ -1,7 +1,5 @@
 """Rollout of a batch in stretches; loss gradients flow within a stretch only."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +22,7 @@ class States(NamedTuple):
     rotations: Float[Tensor, "T N 3 3"]
 
     @staticmethod
-    def of(steps: Sequence[Any]) -> States:
+    def of(steps: Sequence[Any]) -> "States":
         """Stacks the steps of a stretch, which have its fields."""
         return States(*(torch.stack([getattr(step, name) for step in steps]) for name in States._fields))
 

@@ -4,8 +4,6 @@ They are compared with the baseline metrics of each training sequence: the stati
 change of the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -91,7 +89,7 @@ class Measured:
     gradients: dict[str, float]  # norm of each parameter group's loss gradient; equal on all ranks
 
     @staticmethod
-    def join(parts: Sequence[Measured]) -> Measured:
+    def join(parts: "Sequence[Measured]") -> "Measured":
         """The figures that one rank with all sequences would have."""
         if len(parts) == 1:
             return parts[0]

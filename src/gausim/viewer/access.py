@@ -1,7 +1,5 @@
 """Access to the viewer: its address, and the check of Host, Origin, path and token of every request."""
 
-from __future__ import annotations
-
 import hmac
 import re
 import secrets
@@ -35,7 +33,7 @@ class Access:
     names: tuple[str, ...] = ()  # further host names of the page
     token: str | None = None  # of the first request (``?token=...``); made for remote addresses; None: not required
 
-    def checked(self) -> Access:
+    def checked(self) -> "Access":
         """Returns the settings, with a generated token where one is required.
 
         Raises:

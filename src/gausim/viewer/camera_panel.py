@@ -1,7 +1,5 @@
 """Cameras of the data set: the initial view and the list of views."""
 
-from __future__ import annotations
-
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,7 @@ class CameraPanel:
         first_position: camera position of the initial view [page units].
     """
 
-    def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
+    def __init__(self, server: Any, placing: Placing, subject: "Subject") -> None:
         self._server, self._placing, self._cameras = server, placing, subject.cameras
         self.up = np.array(parse_direction(subject.up))
         self.first_position, target, fov = self._first()

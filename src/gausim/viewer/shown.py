@@ -1,7 +1,5 @@
 """Frames for display, and recordings that can be played."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,7 +27,7 @@ class Shown:
     source: str = LIVE  # :data:`LIVE` or the name of a take
 
     @staticmethod
-    def of(now: Interaction) -> Shown:
+    def of(now: Interaction) -> "Shown":
         """The latest frame of an interaction."""
         speed = (now.state.positions - now.state.previous).norm(dim=-1) * now.fps
         return Shown(now.frame, now.unit_of_kernel, speed)

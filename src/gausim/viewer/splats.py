@@ -1,7 +1,5 @@
 """Conversion of frames to viser's buffers: placement, scale and packing into 32 bytes per kernel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +27,7 @@ class Placing:
     scale: float  # page units per scene unit
 
     @staticmethod
-    def of(scene: GaussianScene) -> Placing:
+    def of(scene: GaussianScene) -> "Placing":
         """Centres the simulated kernels and scales their diagonal to :data:`SIZE`."""
         moving = scene.means[scene.simulated].float().cpu()
         return Placing((moving.amax(0) + moving.amin(0)) / 2, SIZE / scene.diagonal)

@@ -1,7 +1,5 @@
 """Particles: constants (mass, volume, pins) and the state that moves."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 
@@ -25,7 +23,7 @@ class ParticleState:
     deformation_gradients: Float[Tensor, "N 3 3"]  # F
 
     @staticmethod
-    def at_rest(positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None) -> ParticleState:
+    def at_rest(positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None) -> "ParticleState":
         """Undeformed particles (F = I, C = 0), at rest unless velocities are given."""
         x = positions.float()
         return ParticleState(
@@ -61,7 +59,7 @@ class Particles:
         density: float,
         volume: Float[Tensor, " N"] | None = None,
         pinned: Bool[Tensor, " N"],
-    ) -> Particles:
+    ) -> "Particles":
         """Particles at rest; without ``volume`` those in a cell divide its volume equally.
 
         Raises:

@@ -1,7 +1,5 @@
 """Anchors: few points whose displacements move and deform all kernels (Spring-Gaus)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -34,7 +32,7 @@ class Anchors:
     diagonal: float  # diagonal of the scene [scene units]
 
     @staticmethod
-    def of(scene: GaussianScene, most: int) -> Anchors:
+    def of(scene: GaussianScene, most: int) -> "Anchors":
         """Anchors at the centres of the occupied cells of a cubic grid over the simulated kernels.
 
         The grid is the finest of which at most ``most`` cells are occupied. An anchor is pinned where at least half

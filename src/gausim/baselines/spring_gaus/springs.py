@@ -10,8 +10,6 @@ and b with -f, so that momentum is conserved and, without damping, energy.
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +39,7 @@ class Net:
     reach: int  # neighbours per anchor
 
     @staticmethod
-    def of(rest: Float[Tensor, "A 3"], pinned: Tensor, neighbours: int) -> Net:
+    def of(rest: Float[Tensor, "A 3"], pinned: Tensor, neighbours: int) -> "Net":
         """Springs from every anchor to its nearest ``neighbours``, each pair once, none between two pinned ones."""
         count = len(rest)
         reach = min(neighbours, count - 1)

@@ -18,8 +18,6 @@ After the frame the body has the deviation q and its velocity v. The trapezoidal
 every mode if it starts from q at t + 1 and, at t, from q - (M + K / 4)^-1 (K q / 2 + M v).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch
@@ -72,7 +70,7 @@ class Coordinates:
     @classmethod
     def of(
         cls, body: Elasticity, positions: Float[Tensor, "K 3"], rotation: Float[Tensor, "3 3"], centre: Tensor | None
-    ) -> Coordinates:
+    ) -> "Coordinates":
         """The coordinates about the ``positions`` of a frame."""
         inertia, stiffness, damping = body.matrices
         if body.free and centre is not None:

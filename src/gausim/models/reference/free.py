@@ -8,8 +8,6 @@ which are the discrete momenta of Stoermer's and Verlet's method. The simulator 
 rotation R of r_{t+1} = R w follows from the second equation by Newton's method.
 """
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -78,7 +76,7 @@ class FreeBody(Body):
         """Rotation of the best fit of the rest shape."""
         return self.pose(state.positions)[1]
 
-    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> FreeMotion:
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> "FreeMotion":
         """The units in the axes of the body, at both times, and the centrifugal load of its rotation."""
         return FreeMotion(self, now, before, state)
 

@@ -10,8 +10,6 @@ All that the body does besides is relative to a and in the axes B, common to all
 or the lengths of springs between units (:mod:`gausim.models.template`), knows no rotation and starts from B^T A.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
@@ -151,7 +149,7 @@ class HeldBody(Body):
         still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
         return torch.where(still[:, None], self.kernels, moved)
 
-    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> "HeldMotion":
         """The units relative to the static shape, and the load of its acceleration, gravity and slope in its axes."""
         return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))
 

@@ -1,7 +1,5 @@
 """Rollouts of one scene by the simulator, without loss gradients: :class:`gausim.core.Steppable`."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace
@@ -58,7 +56,7 @@ class SceneDynamics:
         with evaluating(self.model):
             return roll_out(self.stepper(initial, hands), steps, forces)
 
-    def stepper(self, initial: SimState, hands: Hands | None = None) -> SceneStepper:
+    def stepper(self, initial: SimState, hands: Hands | None = None) -> "SceneStepper":
         """Stepper from an initial state; its steps are those of :meth:`rollout`."""
         return SceneStepper(
             self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling, hands=hands,

@@ -1,7 +1,5 @@
 """Body axes, in which predictions are equivariant to rotations of the scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,7 +52,7 @@ class Frames:
     origins: tuple[Float[Tensor, "_ 3"], ...]  # (N, 3) per level [scene units]
 
     @classmethod
-    def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> Frames:
+    def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> "Frames":
         """Selects the axes and origins of a batch from those of all scenes."""
         rows = [batch.scene_index.index_select(0, level.member) for level in batch.levels]
         return cls(tuple(axes[r] for r in rows), tuple(origins[r] for r in rows))

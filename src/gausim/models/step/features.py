@@ -1,7 +1,5 @@
 """Input features of the network (METHOD section 3)."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -57,7 +55,7 @@ class FeatureOptions:
                 "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
             )
 
-    def of(self, scenes: Sequence[GaussianScene]) -> FeatureOptions:
+    def of(self, scenes: Sequence[GaussianScene]) -> "FeatureOptions":
         """The features of a model of these scenes: without the floor where none of them has one."""
         return replace(self, floor=self.floor and any(scene.surroundings.floor for scene in scenes))
 

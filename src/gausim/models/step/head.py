@@ -1,7 +1,5 @@
 """Heads: the map from the network's output to a deformation gradient."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The network's prediction: a deformation gradient F for every unit of a level (METHOD sections 2 and 3)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Constants of a step, computed once for all steps between two updates of the parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The recursion of METHOD section 2: units deform about their parents, kernels inherit from the finest units."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +39,7 @@ class Solved:
     index: Int[Tensor, " N"]  # the parent of each of the N units below
 
     @classmethod
-    def roots(cls, rest: Float[Tensor, "P 3"]) -> Solved:
+    def roots(cls, rest: Float[Tensor, "P 3"]) -> "Solved":
         """The parents of the units of the top level: one immobile root each."""
         identity = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3).contiguous()
         index = torch.arange(len(rest), device=rest.device)

@@ -1,7 +1,5 @@
 """Base of simulators: the scenes' units and parameters, without the step."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace

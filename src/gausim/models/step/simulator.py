@@ -1,7 +1,5 @@
 """GausSim: one step from x_{t-1}, x_t to x_{t+1}, coarse to fine (METHOD section 2)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

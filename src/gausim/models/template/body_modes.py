@@ -1,7 +1,5 @@
 """The geometry of a scene in modal coordinates: what units and springs contribute to elastic energy and mass."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ small cells, those inside the body with weight 1 and those just around it with w
 well posed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

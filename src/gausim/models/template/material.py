@@ -35,8 +35,6 @@ without damping it conserves energy. It does not amplify vibrations too fast for
 geometric input are distances, so that they generalise to other bodies and orientations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The step of a scene in modal coordinates as plain arrays, for programs without Python such as a web page."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

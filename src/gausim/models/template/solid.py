@@ -4,8 +4,6 @@ Kernels lie on the visible surface of a solid body (:mod:`gausim.models.template
 The resulting modes are smooth across gaps between kernels and across untextured regions.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

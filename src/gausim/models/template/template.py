@@ -6,8 +6,6 @@ deformation gradients. In the paper the template is the rest state. A dynamic te
 zero output continues the motion instead of returning to rest.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

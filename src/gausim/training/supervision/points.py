@@ -1,7 +1,5 @@
 """Supervision by the true motion of points instead of images: fast experiments on dynamics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -55,7 +53,7 @@ class PointSupervision:
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
-    def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> _PointComparison:
+    def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> "_PointComparison":
         """Loss function of the predictions of a batch."""
         truths = [self.motion(sample) for sample in samples]
         for sample, truth in zip(samples, truths, strict=True):
