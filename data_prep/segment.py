@@ -191,7 +191,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--backend", choices=BACKENDS, required=True, help="make the masks in this way")
     add("--every", type=int, default=1, metavar="N", help="take each N-th picture only, to try out (%(default)s)")
     add("--kind", choices=("auto", "film", "stills"), default="auto",
-        help="treat the pictures as a film of a camera that stands still, or as stills; auto: films, and folders in "
+        help="treat the pictures as a film of a static camera, or as stills; auto: films, and folders in "
         "sequences/ (%(default)s)")  # fmt: skip
     add_options(parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)"), Cleanup, unset=True)
     add_options(parser.add_argument_group("backends masks, background and chroma"), ScreenOptions)

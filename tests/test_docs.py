@@ -1,6 +1,7 @@
 """Pages name pages, commands and options that exist; notebooks are stripped; dependencies are pinned."""
 
 import contextlib
+import inspect
 import io
 import json
 import os
@@ -106,6 +107,8 @@ def test_commands_and_options_of_the_pages_exist() -> None:
 
 
 def _composed(argv: list[str]) -> None:
+    from omegaconf import OmegaConf
+
     from gausim.compose.command import jobs_of
     from gausim.compose.config import compose
     from gausim.compose.root import options
@@ -114,7 +117,20 @@ def _composed(argv: list[str]) -> None:
     asked = [word for word in argv if word not in ("-m", "--cfg", "job")]
     asked = ["data=object" if w.startswith("data=") and not set(w[5:].split(",")) <= set(known) else w for w in asked]
     for job in jobs_of(asked):
-        compose(job)
+        _check_arguments(OmegaConf.to_container(compose(job), resolve=True))
+
+
+def _check_arguments(node: object) -> None:
+    """Every key beside a `_target_` is an argument of it."""
+    if isinstance(node, dict):
+        if "_target_" in node:
+            target = pkgutil.resolve_name(node["_target_"])
+            inspect.signature(target).bind_partial(**{name: None for name in node if not name.startswith("_")})
+        for child in node.values():
+            _check_arguments(child)
+    elif isinstance(node, list):
+        for child in node:
+            _check_arguments(child)
 
 
 @pytest.mark.slow

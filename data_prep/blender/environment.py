@@ -48,7 +48,7 @@ class BlenderProcess:
             self.run({"task": "versions"}, lines.append, threading.Event())
             found = json.loads(lines[-1])
         except (IndexError, ValueError):
-            raise BlenderError(f"{self.python}: did not tell its versions. Is this a Python with bpy?") from None
+            raise BlenderError(f"{self.python}: did not print its versions. Is this a Python with bpy?") from None
         except BlenderError as error:
             raise BlenderError(
                 f"{error}\n{self.python}: expected a Python with bpy ({', '.join(REQUIREMENTS)})."

@@ -180,7 +180,7 @@ def test_a_failed_process_says_why(tmp_path: Path) -> None:
         BlenderProcess(tmp_path / "absent").run({}, lambda _: None, threading.Event())
     with pytest.raises(BlenderError, match="--blender-python"):
         find_blender(tmp_path / "absent")
-    with pytest.raises(BlenderError, match="did not tell its versions"):
+    with pytest.raises(BlenderError, match="did not print its versions"):
         BlenderProcess(program(tmp_path / "silent", "sys.stdin.read()")).versions()
 
 

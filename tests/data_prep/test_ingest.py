@@ -222,7 +222,7 @@ def test_silence_and_strangers_sounds_are_refused(tmp_path: Path) -> None:
         measure(films, "audio", given={})
     Camera(2.2, Fraction(25), 40, seed=1).write(tmp_path / "c.mp4")
     films["cam_1"] = probe(tmp_path / "c.mp4")
-    with pytest.raises(DataError, match=r"cam_1 \(c.mp4\) against cam_0.*does not tell where it belongs"):
+    with pytest.raises(DataError, match=r"cam_1 \(c.mp4\) against cam_0.*does not fix its place in time"):
         measure(films, "audio", given={})
 
 

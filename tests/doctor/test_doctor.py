@@ -108,7 +108,12 @@ SAID = {
     "rate over 4": ("motion", "warning", "6 frames per second is no usual rate", "'fps'"),
     "one camera moved": ("calibration", "fault", "cam_1 is not where the pose says", "pose of cam_1"),
     "all cameras moved": ("calibration", "fault", "4 of 4 cameras disagree", "Calibrate all cameras"),
-    "one camera 2 frames late": ("clock", "fault", "cam_1 is out of step: it shows the motion 2 frames later", "cam_1"),
+    "one camera 2 frames late": (
+        "clock",
+        "fault",
+        "cam_1 is not synchronised: it shows the motion 2 frames later",
+        "cam_1",
+    ),
     "one camera 2 frames early": ("clock", "fault", "it shows the motion 2 frames earlier", "all cameras but cam_1"),
     "nothing moves": ("motion", "fault", "Nothing moves", "Record sequences"),
     "16-bit PNG": ("files", "fault", "got 64x64 RGBA (16 bit)", "gausim verify"),
@@ -192,7 +197,7 @@ MORE = {
     "late in one sequence": (lambda root: mistakes.reorder(root / "sequences/seq_002/cam_3", lambda number: number - 3),
                              "clock", "fault", "3 frames later than the other cameras, in seq_002"),
     "late without scene": (lambda root: [(root / "scene.ply").unlink(), mistakes.out_of_step(root, view=0, frames=2)],
-                           "clock", "fault", "cam_0 is out of step"),
+                           "clock", "fault", "cam_0 is not synchronised"),
     "short": (short, "extent", "warning", "Training sees 4 frames"),
 }  # fmt: skip
 

@@ -125,7 +125,7 @@ def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_th
 def test_a_run_of_two_ranks_learns_what_one_does(trainings: Trainings) -> None:
     status, output = trainings("both", *TWO, "plan.epochs=1")
     assert status == 0 and "training on cpu (2 ranks, 1 torch thread)" in output, output
-    assert output.count("Trained for 1 epochs") == 1
+    assert output.count("Trained for 1 epoch ") == 1
     status, output = trainings("alone", "trainer=cpu", "plan.batch_size=2", "plan.epochs=1")
     assert status == 0, output
     found, alone = (rows(trainings.run(name) / "epochs.csv") for name in ("both", "alone"))

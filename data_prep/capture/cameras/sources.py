@@ -37,7 +37,7 @@ class Sources(Options):
 
     images: Path | None = option(None, "pose these photos of the rest state", metavar="DIR")
     sequences: Path | None = option(
-        None, "pose the result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and "
+        None, "pose the result of ingest, or folders SEQ/CAM of frames; cameras are static through a sequence, and "
         "its first frame shows the rest state", metavar="DIR",
     )  # fmt: skip
     fps: float | None = option(

@@ -61,7 +61,7 @@ def sound_lag(first: np.ndarray, second: np.ndarray, rate: int) -> Lag:
         if values[0] >= max(needed, clearer * values[1]):
             return ranked[0]
     raise DataError(
-        "its sound does not tell where it belongs: no place stands out, by the sound itself or by its loudness."
+        "its sound does not fix its place in time: no place stands out, by the sound itself or by its loudness."
     )
 
 

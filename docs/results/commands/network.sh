@@ -9,5 +9,6 @@ gausim train -m data=test/object data.root=data/synthetic_272/flower_soft,data/s
 gausim train data=test/object data.root=data/synthetic_271/pudding_soft $fixed optimizer.decay.network=0 seed=301 name=network/pudding
 gausim train data=test/bunny data.part=null data.sequences=[seq_004,seq_005,seq_006,seq_007,seq_008,seq_009,seq_010,seq_011] $fixed \
   seed=302 name=network/bunny
-find outputs/network -name FINISHED -execdir gausim evaluate . --test --trials 45 \;
+shopt -s globstar
+for finished in outputs/network/**/FINISHED; do gausim evaluate "$(dirname "$finished")" --test --trials 45; done
 gausim report outputs/network --record outputs/network.json

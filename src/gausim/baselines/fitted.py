@@ -131,7 +131,7 @@ class Static(Fitted):
 
     def notes(self) -> tuple[str, ...]:
         """The note that nothing is learned."""
-        return ("Stands still in the rest state; nothing is learned.",)
+        return ("Stays in the rest state; nothing is learned.",)
 
 
 @dataclass(frozen=True, eq=False)

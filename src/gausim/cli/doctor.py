@@ -34,7 +34,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "doctor",
-        " Exits with 1 if a fault would ruin a training. Files and formats are checked first, as `gausim verify "
+        " Exits with 1 if a fault would make training useless. Files and formats are checked first, as `gausim verify "
         "--quick` does.",
     )
     add = parser.add_argument

@@ -144,8 +144,8 @@ def _choose(run: LoadedRun, arguments: argparse.Namespace) -> tuple[str | None, 
             found[item.data.name] = fitting
     if not found:
         raise ConfigError(
-            f"{run.run_dir}: every sequence of it belongs to the test part. When all decisions are made, look with "
-            f"`gausim evaluate {run.run_dir} --test --trials N`, N: the trials made on the development part."
+            f"{run.run_dir}: every sequence of it belongs to the test part. When all decisions are made, evaluate it "
+            f"with `gausim evaluate {run.run_dir} --test --trials N`, N: the trials made on the development part."
             if not arguments.test
             else f"{run.run_dir}: no sequence of the chosen objects belongs to the test part. Leave --test out."
         )

@@ -1,5 +1,6 @@
 """`gausim train`: learn an object's dynamics from multi-view videos."""
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,9 @@ def train(cfg: "DictConfig") -> object:
     from gausim.training.ranks.launch import claim_first
 
     claim_first(cfg.trainer)
+    for handler in logging.getLogger().handlers:
+        if not isinstance(handler, logging.FileHandler):  # times and modules are in the run's train.log
+            handler.setFormatter(logging.Formatter("  %(message)s"))
     run = RunDirectory(run_dir())
     if in_sweep():
         return do_job(cfg, run, train_run)

@@ -59,7 +59,10 @@ def _result(facts: dict[str, Any]) -> list[str]:
         for fault in facts.get("data_faults", ())
     ]
     excess = facts["last_epoch"].get("excess_static")
-    begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
+    counts = [
+        f"{n} {unit}{'s' * (n != 1)}" for n, unit in ((facts["epochs"], "epoch"), (facts["optimizer_steps"], "step"))
+    ]
+    begin = f"Trained for {counts[0]} ({counts[1]})"
     if excess is None or excess < -1:  # the motion is smaller than the error of the reconstruction
         return [f"{begin}.", *more]
     falls = {True: " and still falls", False: " and has stopped falling", None: ""}[facts.get("still_falls")]

@@ -55,7 +55,7 @@ def outliers(scene: GaussianScene) -> list[Outliers]:
     ]
     faults = [
         Outliers(mask, f"{int(mask.sum())} of {scene.count} kernels are {text} (first: number "
-                 f"{int(mask.nonzero()[0])}). They spoil the diagonal and the masses.")
+                 f"{int(mask.nonzero()[0])}). They distort the diagonal and the masses.")
         for mask, text in found if mask.any()
     ]  # fmt: skip
     opacity = scene.opacity_logits[scene.simulated]

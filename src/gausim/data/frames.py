@@ -174,6 +174,4 @@ def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: S
         lens = (cameras.Ks[row] - cameras.Ks[row[0]]).abs().amax((1, 2))
         moved = ((pose > POSE_TOLERANCE * (1 + cameras.viewmats[row[0]].abs().max())) | (lens > 1e-3)).nonzero()
         if len(moved):
-            raise DataError(
-                f"{path}: camera '{view}' moves at frame {int(moved[0])}; sequences need cameras that stand still."
-            )
+            raise DataError(f"{path}: camera '{view}' moves at frame {int(moved[0])}; sequences need static cameras.")

@@ -137,5 +137,5 @@ class SequenceRecord:
     def _sealed(self) -> str:
         return (
             f"the sequence belongs to the test part, of which only images of frames 0..{self.visible - 1} are shown "
-            "until `gausim evaluate RUN --test` has looked. Use sequences of the development part."
+            "until `gausim evaluate RUN --test` has evaluated them. Use sequences of the development part."
         )

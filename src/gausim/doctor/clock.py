@@ -44,7 +44,7 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
         return
     if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
         yield Finding(
-            "note", "Whether the cameras are in step was not checked: their poses are wrong.",
+            "note", "Whether the cameras are synchronised was not checked: their poses are wrong.",
             "Mend the calibration and run this again.",
         )  # fmt: skip
         return
@@ -52,7 +52,7 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
     for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
             "note",
-            f"Whether {view} is in step with the other cameras cannot be told: its motion over time is unlike theirs.",
+            f"Whether {view} is synchronised with the other cameras is undetermined: its motion is unlike theirs.",
             "Compare it by eye in motion.png (--out DIR).", (view,),
         )  # fmt: skip
     if any(lags.values()):
@@ -175,8 +175,8 @@ def _findings(evidence: Evidence, lags: dict[int, int], sequences: list[str]) ->
         )  # fmt: skip
         yield Finding(
             "fault",
-            f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
-            f"{place}.",
+            f"{view} is not synchronised: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than "
+            f"{against}, {place}.",
             f"Number the frames again: {cut}, and cut all cameras to one length. With films: `gausim "
             "prepare ingest` with sound, a flash or `--offsets`.", (view,),
         )  # fmt: skip

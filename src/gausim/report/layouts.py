@@ -41,8 +41,8 @@ _ABLATED = (
 )  # fmt: skip
 _BOUNCE = ("height", "height_error", "rise", "rise_error", "depth")
 _ENERGY_CAPTION = (
-    "Predicted over true motion energy, all sequences together: 1 is right, 0 stands still. A prediction that "
-    "dissipates gets deceptively low errors on late frames; this table tells."
+    "Predicted over true motion energy, all sequences together: 1 is right, 0 is no motion. A prediction that "
+    "dissipates gets deceptively low errors on late frames."
 )
 _COSTS_CAPTION = (
     "Fit: processor time of all sequences and objects together, and the most memory of the training process or of "

@@ -13,7 +13,7 @@ from gausim.results.table import SPLIT_TITLES, VIEW_TITLES, Made, Results
 LEGEND = (
     "Mean, in brackets standard deviation over sequences; `÷ static` is the ratio to the static prediction (below 1 is "
     "better), `÷ ballistic` and `÷ follow hands` to rigid flight and to following the hands at once, of bodies that "
-    "move so; motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still); "
+    "move so; motion energy is the predicted over the true one, all sequences together (1 is right, 0 is no motion); "
     "the floor is the reconstruction itself against frame 0. Images are foreground on black."
 )
 _LATEX = {

@@ -92,7 +92,7 @@ class MotionWatch(Callback):
             try:
                 made = module.predict(first + number, len(truth.positions) - 1)
             except DivergenceError as error:
-                module.print(f"motion of {item.name}/{record.name} is not told: {error}")
+                module.print(f"motion of {item.name}/{record.name} was not measured: {error}")
                 continue
             yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions)
 
