@@ -1,5 +1,6 @@
 """The solid body whose material a shared network decodes from densities and attributes."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from unittest import mock
@@ -153,6 +154,14 @@ def test_springs_have_no_drag_and_half_the_frame_rate_is_the_same_body(hierarchy
     fast, slow = (template.matrices(0, density, attributes, dt) for dt in (1 / 48, 1 / 24))
     torch.testing.assert_close(slow.stiffness, 4 * fast.stiffness)
     torch.testing.assert_close(slow.mass, fast.mass)
+
+
+def test_only_pinned_solids_train_their_resistance_to_growth(hierarchy) -> None:
+    template, material = _template(hierarchy, links=Links(4, damping=0.03)), _material(hierarchy)
+    template.growth.fill_(1.0)
+    assert float(template.matrices(0, *material, 1 / 24).growth) == pytest.approx(0.03 * math.e**2)
+    template.is_pinned = [False]
+    assert float(template.matrices(0, *material, 1 / 24).growth) == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize("finite", [True, False])

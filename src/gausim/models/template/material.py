@@ -155,7 +155,8 @@ class MaterialTemplate(Template):
         self.conserve_volume = conserve_volume
         self.links, self.solid, self.laws = links, solid, [h.law for h in hierarchies]
         body_modes = partial(BodyModes, finest=finest, solid=self.solid, links=self.links.neighbours)
-        counts = [modes * (1 if h.levels[0].pinned.any() else self.solid.free_modes) for h in hierarchies]
+        self.is_pinned = [bool(h.levels[0].pinned.any()) for h in hierarchies]
+        counts = [modes * (1 if pinned else self.solid.free_modes) for pinned in self.is_pinned]
         self.bodies = nn.ModuleList(
             body_modes(h, frame=f, modes=count, finite=h.law == "solid")
             for h, f, count in zip(hierarchies, frames, counts, strict=True)
@@ -216,14 +217,15 @@ class MaterialTemplate(Template):
         """c_0, c_1 and the resistance to growth of a scene [1 / frame, frames, frames].
 
         A net of springs has no drag, and the others as given: a fit would take its errors of phase for damping, since a
-        motion out of step is nearest when it is small.
+        motion out of step is nearest when it is small. A free body has the resistance as given: until it lands it
+        hardly strains, and its first frames would train the resistance on noise.
         """
-        if self.laws[scene_id] == "solid":
-            drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
-            growth = self.links.damping * (GROWTH_GAIN * self.growth).exp()
-        else:
-            viscosity = cast(Tensor, self.log_damping)[1].exp()
-            drag, growth = torch.zeros_like(viscosity), torch.full_like(viscosity, self.links.damping)
+        drag, viscosity = (cast(Tensor, self.log_damping) + DAMPING_GAIN * self.damping).exp()
+        growth = self.links.damping * (GROWTH_GAIN * self.growth).exp()
+        if self.laws[scene_id] != "solid":
+            drag, viscosity = torch.zeros_like(drag), cast(Tensor, self.log_damping)[1].exp()
+        if self.laws[scene_id] != "solid" or not self.is_pinned[scene_id]:
+            growth = torch.full_like(growth, self.links.damping)
         return drag, viscosity * self.viscosity_scale.get(scene_id, 1.0), growth
 
     def matrices(
