@@ -18,6 +18,7 @@ RUN ?= outputs/demo/seed_0
 # What a report is about: runs, sweeps, or folders of them.
 DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
