@@ -11,7 +11,6 @@ from gausim.core import DivergenceError, Frame, Hands, SimState
 from gausim.data.dataset import SampleFacts
 from gausim.models.reference.reference import hand_motion
 from gausim.training.contracts import SceneBatch, Simulator
-from gausim.training.ranks.ranks import Ranks, interleave
 
 
 class States(NamedTuple):
@@ -92,29 +91,6 @@ def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[
             if not value < float("inf"):
                 raise DivergenceError(describe(start + t, samples, sample, f"positions are {value}"))
     return max(map(max, table))
-
-
-def explodes(
-    batch: SceneBatch | None,
-    diagonals: Sequence[float],
-    positions: Float[Tensor, "T K 3"] | None,
-    start: int,
-    samples: Sequence[SampleFacts],
-    limit: float,
-    ranks: Ranks,
-) -> bool:
-    """Whether a kernel of any rank moves further than ``limit`` [diagonals] from rest in a stretch.
-
-    All ranks call it, those without sequences with None, so that a rollout ends on all at once. ``start`` is the number
-    of frames predicted before the stretch; ``samples`` are those of all ranks.
-
-    Raises:
-        DivergenceError: a position is not finite; names the step and the sequence.
-    """
-    extent = None if batch is None or positions is None else reach(batch, diagonals, positions)
-    tables = ranks.gather([] if extent is None else extent.tolist())
-    whole = [interleave(rows) for rows in zip(*filter(None, tables), strict=True)]
-    return check_reach(whole, start, samples) > limit
 
 
 def describe(step: int | None, samples: Sequence[SampleFacts], sample: SampleFacts | None, what: str) -> str:

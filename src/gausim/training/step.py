@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, DivergenceError
+from gausim.core import ConfigError, DivergenceError, Frame, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.losses.objective import static_loss
+from gausim.training.contracts import SceneBatch
 from gausim.training.learner import Learner
 from gausim.training.ranks.ranks import interleave
-from gausim.training.rollout import States, after, describe, explodes, windows
+from gausim.training.rollout import States, after, check_reach, describe, reach, windows
 from gausim.training.statistics import Measured, Statistics
-from gausim.training.terms.rest import rest_term
-from gausim.training.terms.term import StepInputs
 
 # Successive batches whose rollouts explode in the first stretch, after which training counts as diverged.
 BARREN_BATCHES = 20
@@ -41,11 +41,7 @@ class OptimiserStep(Learner):
         whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
         self.exchange.begin(lambda: self._see_first_frame(samples))
         statistics = self.roll_out(samples, whole, draws)
-        inputs = StepInputs(
-            self.simulator, samples, whole, draws, statistics, self.ranks, self.accumulate, self.rest_loss,
-            self.objective, self.images, self.diagonals,
-        )  # fmt: skip
-        rest_term(inputs)
+        statistics.static = self._static_loss(samples, whole, draws)
         self.exchange.step([p for p in self.parameters() if p.requires_grad])
         stats = self._stats(samples, whole, statistics.fetch(self.settings.clip(optimizer)))
         self.exchange.absorb()
@@ -101,9 +97,51 @@ class OptimiserStep(Learner):
             statistics.growth = self.free_motion.descend(batch, state, own, len(whole), free, self.accumulate)
         return statistics
 
-    def _explodes(self, batch: object, positions: Tensor | None, start: int, whole: list[SampleFacts]) -> bool:
-        limit = self.objective.explosion
-        return explodes(batch, self.diagonals, positions, start, whole, limit, self.ranks)  # type: ignore[arg-type]
+    def _explodes(
+        self, batch: SceneBatch | None, positions: Tensor | None, start: int, whole: list[SampleFacts]
+    ) -> bool:
+        """Whether a kernel of any rank moves too far from rest in the stretch after ``start`` predicted frames.
+
+        All ranks call it, those without sequences with None, so that a rollout ends on all at once.
+
+        Raises:
+            DivergenceError: a position is not finite; names the step and the sequence.
+        """
+        own = [] if batch is None or positions is None else reach(batch, self.diagonals, positions).tolist()
+        extent = [interleave(rows) for rows in zip(*filter(None, self.ranks.gather(own)), strict=True)]
+        return check_reach(extent, start, whole) > self.objective.explosion
+
+    def _static_loss(
+        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator
+    ) -> Tensor | None:
+        """Loss of one step from rest, in randomly drawn batches: a body at rest stays there, and its image is frame 0.
+
+        One rank computes a scene's ||x_1 - X||^2 in diagonals; returns this rank's, detached, or None without one.
+        """
+        objective = self.objective
+        if float(torch.rand((), generator=draws)) >= objective.static_chance(whole[0].steps):
+            return None
+        if objective.rest_image_weight and samples:
+            batch = self.simulator.batch([s.scene_id for s in samples])
+            comparison = self.images.comparison(samples, batch, slice(0, 1))
+            losses, _ = comparison(States.of([self._step_from_rest(batch)]), 0)
+            self.accumulate(objective.rest_image_weight / len(whole) * losses.sum())
+        scene_ids = sorted({s.scene_id for s in whole})
+        own = scene_ids[self.ranks.rank :: self.ranks.size]
+        if not own:
+            return None
+        batch = self.simulator.batch(own)
+        made = self._step_from_rest(batch)
+        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), self.diagonals[m.scene_id])
+                              for m in batch.members])  # fmt: skip
+        loss = static_loss(made.positions, batch.rest, diagonal) / len(scene_ids)
+        self.accumulate(objective.static_weight * loss)
+        return loss.detach()
+
+    def _step_from_rest(self, batch: SceneBatch) -> Frame:
+        """One step from rest, without surroundings: what falls does not stay."""
+        prepared = self.simulator.prepare(batch, isolated=True)
+        return self.simulator.step(batch, SimState(batch.rest, batch.rest), prepared=prepared)
 
     def _momentum_unit(self, samples: list[SequenceSample]) -> float:
         """Loss of the rest state on the frames of the batch, over all ranks: the unit of the momentum loss."""
