@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.records import GroundTruth
-from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
@@ -24,20 +23,18 @@ from gausim.training.table import Table, short
 class MotionWatch(Callback):
     """Predicts the first training sequences of every object whose true motion is known, and measures the errors.
 
-    It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. ``gap`` is
-    the generalisation gap, the error on unseen frames less that on seen frames, both over the static prediction's. Rows
-    go to ``motion.csv`` of the run, means over objects to every logger.
+    It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. Errors are
+    over the static prediction's. Rows go to ``motion.csv`` of the run, means over objects to every logger.
     """
 
-    COLUMNS = ("epoch", "step", "object", "error_seen", "error_unseen", "gap", "energy_seen", "energy_unseen")
+    COLUMNS = ("epoch", "step", "object", "error_seen", "error_unseen")
+    SEQUENCES = 4  # of each object
 
-    def __init__(self, *, every_epochs: int = 10, sequences: int = 4) -> None:
-        """Measures every ``every_epochs`` epochs (0: never) and after the last, on ``sequences`` of each object."""
-        if every_epochs < 0 or sequences < 1:
-            raise ConfigError(
-                f"MotionWatch: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
-            )
-        self._every, self._sequences = every_epochs, sequences
+    def __init__(self, *, every_epochs: int = 10) -> None:
+        """Measures every ``every_epochs`` epochs (0: never) and after the last."""
+        if every_epochs < 0:
+            raise ConfigError(f"trainer.motion_epochs: expected at least 0, got {every_epochs}.")
+        self._every = every_epochs
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Drops rows of epochs that a resumed run repeats."""
@@ -65,10 +62,11 @@ class MotionWatch(Callback):
     def _measure(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first, data = {}, 0, training_data(trainer)
         for scene_id, item in enumerate(data.objects):
-            found = list(self._predicted(module, item, scene_id, first)) if scene_id in data.watched else []
+            if scene_id in data.watched and (found := list(self._predicted(module, item, scene_id, first))):
+                seen = item.train_frames.stop
+                errors = {"error_seen": _ratio(found, slice(1, seen)), "error_unseen": _ratio(found, slice(seen, None))}
+                rows[item.name] = {name: value for name, value in errors.items() if value is not None}
             first += len(item.sequences)
-            if found:
-                rows[item.name] = figures(found, item.train_frames.stop)
         return rows
 
     def _predicted(
@@ -85,7 +83,7 @@ class MotionWatch(Callback):
         attached = attach_points(scene, points)
         # Unseen frames of the test part, whose sequences have a limit, may not be looked at.
         shown = [pair for pair in enumerate(item.sequences) if getattr(pair[1], "limit", None) is None]
-        for number, record in shown[: self._sequences]:
+        for number, record in shown[: self.SEQUENCES]:
             truth = item.ground_truth(record)
             if truth is None:
                 continue
@@ -97,21 +95,10 @@ class MotionWatch(Callback):
             yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions)
 
 
-def figures(found: Sequence[tuple[GroundTruth, Tensor]], unseen: int) -> dict[str, float]:
-    """The figures of one object, without those that cannot be computed; ``unseen`` is the first unseen frame."""
-    # Prediction and reference by frame, over all sequences: mean distance from the truth, and motion energy.
-    errors, energies = [], []
-    for truth, points in found:
-        static = truth.rest.expand_as(truth.positions)
-        errors.append([(x - truth.positions).norm(dim=-1).mean(-1).cpu().double().numpy() for x in (points, static)])
-        energies.append([motion_energy(x).cpu().double().numpy() for x in (points, truth.positions)])
-    row = {"error_seen": _ratio(errors, slice(1, unseen)), "error_unseen": _ratio(errors, slice(unseen, None))}
-    row["gap"] = row["error_unseen"] - row["error_seen"]
-    row["energy_seen"] = _ratio(energies, slice(0, unseen - 1))
-    row["energy_unseen"] = _ratio(energies, slice(unseen - 1, None))
-    return {name: value for name, value in row.items() if np.isfinite(value)}
-
-
-def _ratio(pairs: Sequence[Sequence[np.ndarray]], span: slice) -> float:
-    own, reference = (sum(float(pair[i][span].sum()) for pair in pairs) for i in (0, 1))
-    return own / reference if reference > 0 else float("nan")
+def _ratio(found: Sequence[tuple[GroundTruth, Tensor]], frames: slice) -> float | None:
+    """Mean distance of the points from the truth over all sequences, over that of standing still; None without any."""
+    pairs = [
+        (points[frames] - truth.positions[frames], truth.rest - truth.positions[frames]) for truth, points in found
+    ]
+    own, still = (sum(float(pair[i].double().norm(dim=-1).mean(-1).sum()) for pair in pairs) for i in (0, 1))
+    return own / still if still > 0 else None
