@@ -3,15 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gausim.core.errors import (
-    BusyError,
-    ConfigError,
-    DataError,
-    DivergenceError,
-    GausSimError,
-    RunError,
-    SceneError,
-)
+from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
 
 # Only the errors are imported eagerly, so that the command line can report errors without loading torch.
 if TYPE_CHECKING:

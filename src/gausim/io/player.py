@@ -106,9 +106,7 @@ def splat_arrays(scene: GaussianScene) -> tuple[dict[str, np.ndarray], list[floa
     return {name: value.detach().cpu().numpy() for name, value in values.items()}, scales.tolist()
 
 
-def packed(
-    parts: Mapping[str, Mapping[str, np.ndarray]],
-) -> tuple[bytes, dict[str, list[object]], dict[str, int]]:
+def packed(parts: Mapping[str, Mapping[str, np.ndarray]]) -> tuple[bytes, dict[str, list[object]], dict[str, int]]:
     """Arrays of several parts as binary content, its index (type, first byte and count by name), and bytes by part.
 
     Raises:

@@ -23,12 +23,7 @@ def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
 
 
 def comparison(
-    truth: Frames,
-    prediction: Frames,
-    title: str,
-    first_unseen: int,
-    *,
-    height: int = PANEL_HEIGHT,
+    truth: Frames, prediction: Frames, title: str, first_unseen: int, *, height: int = PANEL_HEIGHT
 ) -> Iterator[np.ndarray]:
     """Frames of a video: ground truth | prediction | error, labels above, the time line below.
 

@@ -59,7 +59,6 @@ class ReconstructionOptions:
     rates: LearningRates = field(default_factory=LearningRates)  # Adam's step sizes
 
     def __post_init__(self) -> None:
-        """Checks the ranges, or raises :class:`ConfigError`."""
         for name in ("kernels", "iterations", "hull_resolution"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"reconstruction: {name} must be at least 1, got {getattr(self, name)}.")
@@ -112,12 +111,7 @@ class Reconstruction:
     """
 
     def __init__(
-        self,
-        sets: Sequence[ImageSet],
-        renderer: Renderer,
-        options: ReconstructionOptions,
-        *,
-        name: str,
+        self, sets: Sequence[ImageSet], renderer: Renderer, options: ReconstructionOptions, *, name: str
     ) -> None:
         """Places the first kernels (see :func:`reconstruct`)."""
         self._sets, self._renderer, self._options, self._name = list(sets), renderer, options, name

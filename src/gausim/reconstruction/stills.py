@@ -45,11 +45,7 @@ class Material:
 
 
 def gather_stills(
-    path: Path,
-    *,
-    every: int = STILLS_PER_HELDOUT,
-    longest: int | None = None,
-    coarse: float = 0.0,
+    path: Path, *, every: int = STILLS_PER_HELDOUT, longest: int | None = None, coarse: float = 0.0
 ) -> Material:
     """The stills of the ``transforms.json`` at ``path``; one in ``every`` is not used in training but only measured.
 

@@ -55,12 +55,7 @@ class Hierarchy:
         return sum(int((~self.levels[level].pinned).sum()) for level in predicted)
 
 
-def build_hierarchy(
-    scene: GaussianScene,
-    *,
-    radii: Sequence[float],
-    axes: np.ndarray | None = None,
-) -> Hierarchy:
+def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], axes: np.ndarray | None = None) -> Hierarchy:
     """Clusters the simulated kernels level by level.
 
     Args:
