@@ -64,7 +64,7 @@ def test_step_asks_its_device_nothing(monkeypatch: pytest.MonkeyPatch, template:
         _ = level.member, level.device_radii  # kept from then on
     step = step_of(model)
     state = SimState(state.positions.to("meta"), state.previous.to("meta"))
-    with torch.no_grad(), asking_nothing(monkeypatch):
+    with torch.no_grad(), asking_nothing():
         frames = roll(step, state, state.previous)
     assert {frame.deformation_gradients.device.type for frame in frames} == {"meta"}
 

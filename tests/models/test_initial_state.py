@@ -58,17 +58,6 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
         assert torch.allclose(within, offset @ (deformation_gradients[c] @ velocity).T, atol=1e-5)
 
 
-def test_only_vibrations_may_have_velocities(model, monkeypatch: pytest.MonkeyPatch) -> None:
-    every = ModalInitialStates(model, [0])
-    monkeypatch.setattr(model.template, "vibrations", lambda scene_id: 3)
-    some = ModalInitialStates(model, [0], vibrations=True)
-    assert [len(initial.velocity[0]) for initial in (every, some)] == [5, 3]
-    with torch.no_grad():
-        some.velocity[0].copy_(torch.tensor([0.2, -0.1, 0.3]))
-        every.velocity[0][:3] = some.velocity[0]
-    torch.testing.assert_close(some.motion(0), every.motion(0))
-
-
 def test_a_rest_template_has_the_modes_of_an_even_solid() -> None:
     simulator = make_model(make_scene(40))
     motions, free = simulator.smooth_motions(0), simulator.scenes[0].simulated & ~simulator.scenes[0].pinned
@@ -80,9 +69,7 @@ def test_a_rest_template_has_the_modes_of_an_even_solid() -> None:
     torch.testing.assert_close(initial.motion(0).float(), shown, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "kind", [FreeInitialStates, ModalInitialStates, partial(ModalInitialStates, in_diagonals=True)]
-)
+@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
 def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) -> None:
     initial = kind(model, [0, 1])
     furthest = []
@@ -94,22 +81,9 @@ def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) 
     assert initial.reach(0.3) == pytest.approx(min(furthest), rel=1e-5)
 
 
-def test_in_diagonals_every_mode_of_every_scene_moves_alike(model) -> None:
-    initial, plain = ModalInitialStates(model, [0, 1], in_diagonals=True), ModalInitialStates(model, [0, 1])
-    for number, scene in enumerate(model.scenes):
-        for mode in range(5):
-            for states in (initial, plain):
-                with torch.no_grad():
-                    states.velocity[number].zero_()[mode] = 0.01
-            moved, other = (states.state(number).previous.detach() - scene.means for states in (initial, plain))
-            assert float(moved.norm(dim=-1).max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-4)
-            along = (moved * other).sum() / (moved.norm() * other.norm())
-            assert float(along) == pytest.approx(1.0, abs=1e-5)
-
-
 def _module() -> GausSimModule:
     template = partial(MaterialTemplate, modes=6)  # the elastic one fixes the signs of its modes
-    return real_module((0, 0), template=template, states=partial(ModalInitialStates, in_diagonals=True))
+    return real_module((0, 0), template=template, states=ModalInitialStates)
 
 
 @torch.no_grad()

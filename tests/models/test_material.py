@@ -96,7 +96,8 @@ def test_springs_add_their_stiffness_and_no_mass(hierarchy) -> None:
     material, dt, ends = _material(hierarchy), 1 / 24, net.body(0).springs.ends
     found = net.matrices(0, *material, dt)
     # The same vibrations, the lowest ones, are among the modes of both laws.
-    count, k = solid.vibrations(0), (2 * np.pi / 8) ** 2
+    modes, k = len(net.body(0).values), (2 * np.pi / 8) ** 2
+    count = modes - modes // 2
     torch.testing.assert_close(found.mass, _masses(net.body(0), material[0]))
     stretch = net.body(0).stretch
     springs = stretch.mT @ (net.decode(net.body(0), material[1])[1].exp()[:, None] * stretch)

@@ -64,9 +64,8 @@ def test_wrong_types_options_and_changed_inputs_are_refused(inputs: Callable) ->
         images.rgb.sum().backward()
     with pytest.raises(ConfigError, match="means as float32"):
         inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(CpuRenderer())
-    for options in ({"threads": 0}, {"near": 0.0}):
-        with pytest.raises(ConfigError, match=next(iter(options))):
-            CpuRenderer(**options)
+    with pytest.raises(ConfigError, match="threads"):
+        CpuRenderer(threads=0)
 
 
 @pytest.mark.parametrize("name", ["means", "covars", "colors", "opacities"])

@@ -15,7 +15,7 @@ from gausim.render import gsplat as backend
 from gausim.render.auto import AutoRenderer, chosen
 from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
-from gausim.render.reference import ReferenceRenderer
+from gausim.render.reference import NEAR, ReferenceRenderer
 
 REASON = "gsplat is not installed (pip install 'gausim[gpu]')"
 
@@ -69,14 +69,14 @@ def rasterization(
 ):  # fmt: skip
     """gsplat 1.5.3's function of that name: its arguments, its checks of shapes, its reading of the covariances."""
     batch, count, views = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    assert quats is None and scales is None and (radius_clip, eps2d, packed) == (0.0, 0.3, False)
+    assert quats is None and scales is None and (near_plane, radius_clip, eps2d, packed) == (NEAR, 0.0, 0.3, False)
     assert means.shape == (*batch, count, 3) and covars.shape == (*batch, count, 3, 3)
     assert opacities.shape == (*batch, count) and colors.shape == (*batch, views, count, 3)
     assert viewmats.shape == (*batch, views, 4, 4) and Ks.shape == (*batch, views, 3, 3)
     assert backgrounds.shape == (*batch, views, 3)
     upper = covars.triu()
     given = means, upper + upper.mT.tril(-1), colors, opacities, viewmats, Ks, (width, height)
-    drawn = ReferenceRenderer(near=near_plane)(*given)
+    drawn = ReferenceRenderer()(*given)
     image = drawn.rgb + (1 - drawn.alpha)[..., None] * backgrounds[..., None, None, :]
     return image, drawn.alpha[..., None], {}
 
@@ -103,11 +103,9 @@ def assert_same(images: Rendered, expected: Rendered, atol: float) -> None:
 def test_states_views_and_empty_scenes_reach_gsplat(inputs: Callable, stand_in: ModuleType) -> None:
     given = inputs(2, 3, 80, (34, 22)).to(torch.float32)
     arguments = (*given.tensors[:4], given.viewmats, given.Ks, given.size)
-    images = GsplatRenderer(near=2.3)(*arguments, background=given.background)
-    expected = ReferenceRenderer(near=2.3)(*arguments, background=given.background)
-    assert_same(images, expected, 1e-6)
-    assert_same(GsplatRenderer()(*arguments), ReferenceRenderer()(*arguments), 1e-6)  # another near plane, black
-    assert float((expected.alpha - ReferenceRenderer()(*arguments).alpha).abs().max()) > 0.01
+    images = GsplatRenderer()(*arguments, background=given.background)
+    assert_same(images, ReferenceRenderer()(*arguments, background=given.background), 1e-6)
+    assert_same(GsplatRenderer()(*arguments), ReferenceRenderer()(*arguments), 1e-6)  # on black
     # gsplat itself would divide by their number.
     given = inputs(2, 3, 4, (10, 6)).to(torch.float32)
     none = [x[:, :0] for x in (given.means, given.covars)] + [given.colors[:, :, :0], given.opacities[:, :0]]
@@ -132,8 +130,6 @@ def test_gradients_come_back_whole(inputs: Callable, stand_in: ModuleType) -> No
 def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleType) -> None:
     with pytest.raises(ConfigError, match="means as float32 on a CUDA device, got torch.float64"):
         inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(GsplatRenderer())
-    with pytest.raises(ConfigError, match=r"render.near: expected more than 0, got 0\.0"):
-        GsplatRenderer(near=0.0)
 
 
 @pytest.mark.gpu

@@ -74,12 +74,12 @@ def traced(device: str, template: Any) -> tuple[_Stretch, list[Tensor], list[Ten
 
 
 @TEMPLATES
-def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(monkeypatch: pytest.MonkeyPatch, template: Any) -> None:
+def test_a_rollout_and_its_backward_pass_ask_the_device_nothing(template: Any) -> None:
     """Preparation included, for a graph captures all three."""
     stretch, given, trained = traced("meta", template)
-    with asking_nothing(monkeypatch, watched=False):
+    with asking_nothing(watched=False):
         stretch(*given)  # what a batch keeps from its first use on
-    with asking_nothing(monkeypatch):
+    with asking_nothing():
         made = [x for x in stretch(*given) if x.requires_grad]
         found = torch.autograd.grad(made, trained, [torch.empty_like(x) for x in made], allow_unused=True)
     assert sum(gradient is not None for gradient in found) > len(trained) / 2

@@ -13,7 +13,6 @@ from gausim.models.reference.surroundings import SceneSurroundings
 from gausim.models.step.simulator import GausSim
 from gausim.ops.rotation import rotation_of
 
-TINY = 1e-12
 # Numbers of a free body's start: translation [diagonals], rotation [radian], velocity and spin per frame.
 START = 12
 
@@ -28,7 +27,6 @@ class InitialStates(nn.Module, ABC):
     """
 
     def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
-        """Stores the rest states."""
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
@@ -127,32 +125,11 @@ class ModalInitialStates(InitialStates):
     The velocity field of an elastic body is smooth; most per-kernel offsets would remain undetermined by 16 frames.
     """
 
-    def __init__(
-        self,
-        model: GausSim,
-        scene_of_sequence: Sequence[int],
-        *,
-        vibrations: bool = False,
-        in_diagonals: bool = False,
-    ) -> None:
-        """Creates one parameter per sequence, initially zero.
-
-        Args:
-            model: the simulator, of whose template the modes are.
-            scene_of_sequence: index of the scene of each sequence.
-            vibrations: only these have a velocity. Modal derivatives only follow them; with velocities of their own
-                they would swing on, far above the frame rate. False for runs that have velocities of all modes.
-            in_diagonals: normalise phi_m to a largest kernel displacement of one diagonal, so that one learning rate
-                means the same motion for every object and template; else v_m is in the template's units.
-        """
+    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
+        """Creates one parameter per sequence, initially zero; v_m is in the template's units."""
         super().__init__(model, scene_of_sequence)
-        self._basis = []
-        for scene_id, diagonal in enumerate(self._diagonal):
-            motions = model.smooth_motions(scene_id)
-            moving = model.template.vibrations(scene_id) if vibrations else None
-            basis = (motions.kernels / motions.sizes)[..., :moving]
-            most = basis.norm(dim=1).amax(0).clamp_min(TINY)
-            self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
+        every = (model.smooth_motions(scene_id) for scene_id in range(len(self._rest)))
+        self._basis = [motions.kernels / motions.sizes for motions in every]
         sizes = [b.shape[-1] + (START if free else 0) for b, free in zip(self._basis, self._is_free, strict=True)]
         self.velocity = nn.ParameterList(torch.zeros(sizes[i]) for i in self.scene_of_sequence)
 

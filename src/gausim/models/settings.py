@@ -33,7 +33,6 @@ class HierarchySettings:
     body_frame: bool = True
 
     def __post_init__(self) -> None:
-        """Checks the levels and the rule."""
         if self.edges not in EDGES:
             raise ConfigError(f"model.simulator.hierarchy.edges is '{self.edges}'; expected one of {', '.join(EDGES)}.")
         if not self.levels or any(set(level) != {"diameter", "edge_length"} for level in self.levels):

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from gausim.core import ConfigError
 from gausim.nn.mlp import mlp
 
-PRECISIONS = ("fp32", "bf16")
 NORMS = ("pre", "joint")
 
 
@@ -57,10 +56,7 @@ class _JointLayer(nn.Module):
 
 
 class MeshGraphNet(nn.Module):
-    """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
-
-    ``precision`` does not change the parameters: checkpoints fit both values.
-    """
+    """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs."""
 
     def __init__(
         self,
@@ -71,7 +67,6 @@ class MeshGraphNet(nn.Module):
         hidden: int = 48,
         layers: int = 3,
         norm: str = "pre",
-        precision: str = "fp32",
     ) -> None:
         """Builds the network.
 
@@ -84,17 +79,13 @@ class MeshGraphNet(nn.Module):
             norm: LayerNorm ``pre`` (of the inputs of a residual update), or ``joint``: the authors' layers, with three
                 linear layers per MLP, one LayerNorm over all inputs of each, none before the decoder, and ReLU in
                 encoders and decoder.
-            precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
-                encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
 
         Raises:
-            ConfigError: unknown precision or norm.
+            ConfigError: unknown norm.
         """
         super().__init__()
-        for name, given, known in (("precision", precision, PRECISIONS), ("norm", norm, NORMS)):
-            if given not in known:
-                raise ConfigError(f"model.simulator.network.{name} is '{given}'; expected one of {', '.join(known)}.")
-        self.precision = precision
+        if norm not in NORMS:
+            raise ConfigError(f"model.simulator.network.norm is '{norm}'; expected one of {', '.join(NORMS)}.")
         ends, layer = ("relu", _JointLayer) if norm == "joint" else ("silu", _SplitLayer)
         self.node_encoder = mlp((node_features, hidden, hidden), ends)
         self.edge_encoder = mlp((edge_features, hidden, hidden), ends)
@@ -106,13 +97,8 @@ class MeshGraphNet(nn.Module):
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
     ) -> Float[Tensor, "N Co"]:
         """Outputs per node; ``edge_index`` is (source, destination), preferably sorted by destination."""
-        device = node_features.device.type
-        bf16 = self.precision == "bf16" or torch.is_autocast_enabled(device)
-        with torch.autocast(device, enabled=False):
-            nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
-        with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
-            for layer in self.processor:
-                nodes, edges = layer(nodes, edges, edge_index)
-        with torch.autocast(device, enabled=False):
-            result: Tensor = self.decoder(self.norm(nodes))
+        nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
+        for layer in self.processor:
+            nodes, edges = layer(nodes, edges, edge_index)
+        result: Tensor = self.decoder(self.norm(nodes))
         return result

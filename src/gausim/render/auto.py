@@ -22,19 +22,9 @@ class AutoRenderer:
     device, with the reason where gsplat is not used.
     """
 
-    def __init__(self, *, threads: int | None = None, near: float = 0.01) -> None:
-        """Sets the options.
-
-        Args:
-            threads: worker threads of the CPU renderer; None means torch.get_num_threads() at the time of each call.
-            near: kernels closer than this to the camera plane are dropped [scene units].
-
-        Raises:
-            ConfigError: an option is out of range.
-        """
-        self.threads, self.near = threads, near
-        self.cpu = CpuRenderer(threads=threads, near=near)
-        self.gsplat = gsplat.GsplatRenderer(near=near)
+    def __init__(self, *, threads: int | None = None) -> None:
+        """``threads`` are those of :class:`CpuRenderer`."""
+        self.cpu, self.gsplat = CpuRenderer(threads=threads), gsplat.GsplatRenderer()
 
     def __call__(self, means: Tensor, *inputs: Any, background: Tensor | None = None) -> Rendered:
         """Draws B states in V views each; the arguments are those of core.Renderer."""

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.render.reference import DILATION, checked_near
+from gausim.render.reference import DILATION, NEAR
 
 VERSION = "1.5.3"  # with the ceiling of alpha that is compiled in
 DEVICE = "cuda"  # the type of the devices that gsplat draws on
@@ -49,17 +49,6 @@ class GsplatRenderer:
     plane within 1e10 scene units. All states and views are one call of gsplat. It waits for the device once per call,
     for the number of tiles that the kernels touch. Values are not checked for being finite.
     """
-
-    def __init__(self, *, near: float = 0.01) -> None:
-        """Sets the options.
-
-        Args:
-            near: kernels closer than this to the camera plane are dropped [scene units].
-
-        Raises:
-            ConfigError: an option is out of range.
-        """
-        self.near = checked_near(near)
 
     def __call__(
         self,
@@ -101,7 +90,7 @@ class GsplatRenderer:
             Ks=Ks,
             width=size[0],
             height=size[1],
-            near_plane=self.near,
+            near_plane=NEAR,
             radius_clip=0.0,
             eps2d=DILATION,
             packed=False,

@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import ConfigError, Rendered
+from gausim.core import Rendered
 
+NEAR = 0.01  # kernels closer than this to the camera plane are dropped [scene units]
 DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999  # ceiling of a kernel's opacity at a pixel; compiled into gsplat 1.5.3 (0.99 on its main branch)
@@ -14,30 +15,12 @@ T_STOP = 1e-4  # a kernel that would leave less transmittance than this ends its
 TILE = 16  # [pixels]
 
 
-def checked_near(near: float) -> float:
-    """The option ``near`` of all renderers; raises :class:`ConfigError` where it is out of range."""
-    if not near > 0:
-        raise ConfigError(f"render.near: expected more than 0, got {near}.")
-    return near
-
-
 class ReferenceRenderer:
     """EWA splatting after gsplat, sorted by depth and composited front to back (core.Renderer).
 
     Works in the type and on the device of its inputs. Kernels are culled per tile only where alpha < 1/255 at every
     pixel, so the result equals the sum over all kernels. Memory grows with the kernels of the fullest tile.
     """
-
-    def __init__(self, *, near: float = 0.01) -> None:
-        """Sets the options.
-
-        Args:
-            near: kernels closer than this to the camera plane are dropped [scene units].
-
-        Raises:
-            ConfigError: an option is out of range.
-        """
-        self.near = checked_near(near)
 
     def __call__(
         self,
@@ -74,7 +57,7 @@ class ReferenceRenderer:
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
         """Colour before the background, and remaining transmittance of one view."""
         camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        visible = (camera[:, 2] > self.near) & (opacities >= ALPHA_MIN)
+        visible = (camera[:, 2] > NEAR) & (opacities >= ALPHA_MIN)
         index = visible.nonzero()[:, 0]
         index = index[torch.argsort(camera[index, 2].detach(), stable=True)]
         mean2d, covar2d = project(camera[index], covars[index], viewmat[:3, :3], K, size)

@@ -46,7 +46,6 @@ class Grid:
 
     cells: int = 50  # cells per axis; nodes are one more
     size: float = 2.0  # edge L of the domain [simulation units]
-    damping: float = 0.0  # rate at which nodes lose velocity [1 / s]; 0 is none
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # acceleration of all nodes [simulation units / s^2]
     slope: Slope | None = None  # the floor; None: there is none
 
@@ -55,8 +54,6 @@ class Grid:
             raise ConfigError(f"cells: expected at least 4 (a particle touches 3 nodes), got {self.cells}.")
         if not 0 < self.size < math.inf:
             raise ConfigError(f"size: expected a positive edge of the domain, got {self.size}.")
-        if self.damping < 0:
-            raise ConfigError(f"damping: expected a rate that is not negative, got {self.damping}.")
 
     @property
     def dx(self) -> float:

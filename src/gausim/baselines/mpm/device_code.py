@@ -150,7 +150,6 @@ def particles_to_grid(
 def grid_update(
     grid: wp.array3d[wp.vec4],
     pinned_nodes: wp.array3d[wp.uint8],
-    kept: float,
     pull: wp.vec3,
     normal: wp.vec3,
     level: float,
@@ -158,7 +157,7 @@ def grid_update(
     origin: wp.vec3,
     velocity: wp.array3d[wp.vec3],
 ) -> None:
-    """Velocity of nodes: momentum over mass, damped by the factor ``kept``, plus ``pull``; 0 where nodes are pinned.
+    """Velocity of nodes: momentum over mass, plus ``pull``; 0 where nodes are pinned.
 
     Nodes on or behind the plane n . x = ``level`` [cells] lose their velocity into it, and along it as much as
     Coulomb's friction takes; without a plane n is 0.
@@ -167,7 +166,7 @@ def grid_update(
     node = grid[i, j, k]
     v = wp.vec3(0.0, 0.0, 0.0)
     if node[3] >= LEAST_NODE_MASS:
-        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + pull
+        v = wp.vec3(node[0], node[1], node[2]) / node[3] + pull
         place = origin + wp.vec3(float(i), float(j), float(k))
         into = wp.dot(v, normal)
         if into < 0.0 and wp.dot(place, normal) <= level:

@@ -53,20 +53,15 @@ class Particles:
 
     @staticmethod
     def create(
-        positions: Float[Tensor, "N 3"],
-        *,
-        grid: Grid,
-        density: float,
-        volume: Float[Tensor, " N"] | None = None,
-        pinned: Bool[Tensor, " N"],
+        positions: Float[Tensor, "N 3"], *, grid: Grid, density: float, pinned: Bool[Tensor, " N"]
     ) -> "Particles":
-        """Particles at rest; without ``volume`` those in a cell divide its volume equally.
+        """Particles at rest; those in a cell divide its volume equally.
 
         Raises:
             DivergenceError: a particle lies outside the domain.
         """
         require_inside(positions, grid, "at rest")
-        volume = particle_volumes(positions, grid) if volume is None else volume.float()
+        volume = particle_volumes(positions, grid)
         nodes = torch.zeros((grid.cells + 1,) * 3, dtype=torch.bool, device=positions.device)
         if pinned.any():
             held = node_volumes(positions[pinned], volume[pinned], grid)

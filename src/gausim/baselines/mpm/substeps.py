@@ -134,12 +134,11 @@ class Substeps:
         """Kernel, size, inputs and outputs of each launch of a substep."""
         (x, v, C, F), kernels, grid = state, self._kernels, self._grid
         origin, nodes = self._wp.vec3(*map(float, window.origin)), self._wp.vec3i(*window.shape)
-        kept = max(0.0, 1 - grid.damping * dt)
         pull = self._wp.vec3(*(dt * g for g in grid.gravity))
         slope = grid.slope or Slope()
         floor = [self._wp.vec3(*slope.normal), slope.level / grid.dx, slope.friction]
         scattered = [x, v, C, self._stress, self._mass, self._volume, 1 / grid.dx, origin, nodes, dt]
-        updated = [window.momentum, self._pinned_nodes, kept, pull, *floor, origin]
+        updated = [window.momentum, self._pinned_nodes, pull, *floor, origin]
         gathered = [x, F, window.velocity, self._held, 1 / grid.dx, origin, nodes, dt]
         return [
             (kernels.stress_kernel, self.count, [F, young, self._material.poisson_ratio], [self._stress]),

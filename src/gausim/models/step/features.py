@@ -30,7 +30,6 @@ class FeatureOptions:
             (x_{t+1} + 2 x_t + x_{t-1}) / 4. What turns round in every frame is not seen there, and not driven on.
         history: frames before the last two of which the velocities are inputs, too; for bodies in fixed pins.
         attributes: material attributes per unit.
-        normaliser_floor: smallest standard deviation of a normalised input.
         floor: nearness of the units to the floor, in models of which a scene has one.
 
     Raises:
@@ -43,11 +42,9 @@ class FeatureOptions:
     centred: bool = True
     history: int = 0
     attributes: int = 8
-    normaliser_floor: float = 1e-2
     floor: bool = True
 
     def __post_init__(self) -> None:
-        """Checks the choices."""
         if self.history < 0:
             raise ConfigError(f"model.simulator.features.history: expected at least 0, got {self.history}.")
         if not (self.velocities or self.rest_inputs):

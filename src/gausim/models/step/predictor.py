@@ -48,8 +48,8 @@ class DeformationPredictor(nn.Module):
         """
         super().__init__()
         self.features, self.edges, self.head, self._conserve_mass = features, edges, head, conserve_mass
-        self.node_normaliser = RunningNormaliser(features.node_normalised, floor=features.normaliser_floor)
-        self.edge_normaliser = RunningNormaliser(features.edge_normalised, floor=features.normaliser_floor)
+        self.node_normaliser = RunningNormaliser(features.node_normalised)
+        self.edge_normaliser = RunningNormaliser(features.edge_normalised)
         sizes = {"node_features": features.node_size, "edge_features": features.edge_size, "outputs": head.outputs}
         self.network = network(**sizes)
         if head.zero_output:

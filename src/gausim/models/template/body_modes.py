@@ -97,7 +97,6 @@ class BodyModes(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
         self.springs = springs
         self.cells = FiniteStrain(*body.mean_gradients(rest), scale=1 / lowest) if finite else None
-        self.vibrations = body.vibrations
 
 
 def _net(

@@ -320,10 +320,6 @@ class MaterialTemplate(Template):
         sizes = body.values**-0.25
         return body.modes * (body.scale * sizes), body.gradients * (body.scale * sizes), sizes
 
-    def vibrations(self, scene_id: int) -> int:
-        """All modes but the modal derivatives of finite strain."""
-        return self.body(scene_id).vibrations
-
 
 def _inertia(
     body: BodyModes, density: Float[Tensor, " N"], lost: Float[Tensor, " N"]

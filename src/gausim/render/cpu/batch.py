@@ -21,6 +21,7 @@ from gausim.render.cpu.projection import (
     project_kernels,
 )
 from gausim.render.cpu.raster import PIXELS, backward_band, forward_band
+from gausim.render.reference import NEAR
 
 Array = NDArray[Any]
 
@@ -93,7 +94,6 @@ class Batch:
     background: Array  # (3,)
     width: int
     height: int
-    near: float
     views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @cached_property
@@ -213,7 +213,7 @@ class Batch:
                 "them so."
             )
         project_kernels(
-            *kernels, self.viewmats[b, v], self.Ks[b, v], self.width, self.height, self.near, low, high,
+            *kernels, self.viewmats[b, v], self.Ks[b, v], self.width, self.height, NEAR, low, high,
             view.records, view.extents, view.spans, view.depth,
         )  # fmt: skip
 

@@ -12,7 +12,6 @@ from gausim.kernels.announce import announced
 from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.batch import Batch, Images
-from gausim.render.reference import checked_near
 
 
 class _Render(torch.autograd.Function):
@@ -56,19 +55,15 @@ class CpuRenderer:
     The first call compiles for some seconds; numba's cache keeps the compiled code.
     """
 
-    def __init__(self, *, threads: int | None = None, near: float = 0.01) -> None:
-        """Sets the options.
-
-        Args:
-            threads: worker threads; None means torch.get_num_threads() at the time of each call.
-            near: kernels closer than this to the camera plane are dropped [scene units].
+    def __init__(self, *, threads: int | None = None) -> None:
+        """``threads`` are worker threads; None means torch.get_num_threads() at the time of each call.
 
         Raises:
-            ConfigError: an option is out of range.
+            ConfigError: fewer than one.
         """
         if threads is not None and threads < 1:
             raise ConfigError(f"render.threads: expected at least 1, got {threads}.")
-        self.threads, self.near = threads, checked_near(near)
+        self.threads = threads
 
     def __call__(
         self,
@@ -100,4 +95,4 @@ class CpuRenderer:
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
         pool = shared_pool(self.threads or torch.get_num_threads())
         with announced("the CPU renderer"):
-            return Rendered(*_Render.apply(*inputs.values(), pool, keep, viewmats, Ks, *size, self.near))
+            return Rendered(*_Render.apply(*inputs.values(), pool, keep, viewmats, Ks, *size))
