@@ -23,7 +23,6 @@ class Field(nn.Module):
     """Offsets of position, logarithmic scales and quaternion at points of space and time; all zero at first."""
 
     def __init__(self, resolution: Sequence[int], features: int, hidden: int) -> None:
-        """Draws its parameters from the global generator."""
         super().__init__()
         self.planes = Planes(resolution, features)  # features
         self.trunk = nn.Linear(features, hidden)  # the layer before the heads

@@ -167,13 +167,7 @@ def _can_warm_start(config: DictConfig, datamodule: ReadyDataModule) -> bool:
     return compared != "PointSupervision" or all(record.hands is None for _, record in datamodule.index.entries)
 
 
-def load_run(
-    run_dir: Path | str,
-    *,
-    checkpoint: str = "last.ckpt",
-    data: Mapping[str, Any] | None = None,
-    device: str = "cpu",
-) -> LoadedRun:
+def load_run(run_dir: Path | str, *, data: Mapping[str, Any] | None = None, device: str = "cpu") -> LoadedRun:
     """Loads a run; its test part is sealed until `gausim evaluate --test` has looked at it.
 
     ``data`` replaces keys of the data configuration, e.g. ``{"root": "/elsewhere"}``; ``device`` as for
@@ -190,11 +184,11 @@ def load_run(
             f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
             f"it: `gausim train data=OBJECT init_from={directory.path}`."
         )
-    config, module, datamodule = _load(directory, checkpoint, data)
+    config, module, datamodule = _load(directory, data)
     # A renderer of the other kind of device gives way to the one that fits.
     renderer: Renderer = module.renderer
     if isinstance(renderer, CpuRenderer if place.type == "cuda" else GsplatRenderer):
-        renderer = cast(Renderer, AutoRenderer(near=renderer.near))
+        renderer = cast(Renderer, AutoRenderer())
     return LoadedRun(config, module.to(place), datamodule.objects, datamodule, renderer, directory.path, place)
 
 
@@ -209,21 +203,21 @@ def load_corpus_run(
 ) -> tuple[GausSimModule, CorpusDataModule]:
     """Loads a run of which :func:`is_pretrained` is true; arguments and errors are those of :func:`load_run`."""
     place = find_device(device)
-    _, module, datamodule = _load(RunDirectory(run_dir), "last.ckpt", data)
+    _, module, datamodule = _load(RunDirectory(run_dir), data)
     return cast(GausSimModule, module.to(place)), cast(CorpusDataModule, datamodule)
 
 
 def _load(
-    directory: RunDirectory, checkpoint: str, data: Mapping[str, Any] | None
+    directory: RunDirectory, data: Mapping[str, Any] | None
 ) -> tuple[dict[str, Any], GausSimModule | FittedModule, ReadyDataModule]:
     """Configuration, module and data of a run, in evaluation mode with the run's weights."""
     config = directory.config()
-    loaded = read_checkpoint(directory.path / checkpoint)
+    loaded = read_checkpoint(directory.checkpoint)
     config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
     if datamodule.has_videos and (changed := changed_files(directory.path, datamodule.objects)):
         logger.warning("%s What follows is of the data as they are now.", changed)
-    check_scenes(loaded, module.scenes, str(directory.path / checkpoint))
+    check_scenes(loaded, module.scenes, str(directory.checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)
     module.eval()

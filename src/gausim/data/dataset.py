@@ -82,7 +82,6 @@ class SequenceIndex(Dataset):
         ]
 
     def __len__(self) -> int:
-        """Number of sequences over all objects."""
         return len(self.entries)
 
     def __getitem__(self, key: SampleKey) -> SequenceSample:

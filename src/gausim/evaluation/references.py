@@ -73,7 +73,6 @@ class Bounces:
     """Bounces of all sequences of a free body that falls on a floor; of others nothing."""
 
     def __init__(self, data: ObjectData) -> None:
-        """Starts without sequences."""
         self._floor = data.surroundings.floor if data.surroundings.free else None
         self._found: dict[str, list[Bounce]] = {}
         self._diagonal = 1.0

@@ -27,7 +27,6 @@ class EnergyLoss:
     probability: float = 0.2
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         if (self.weight or 0) < 0 or not 0 <= self.probability <= 1 or not 0 < self.stretch < self.frames:
             raise ConfigError(
                 "loss.energy: expected weight >= 0 or null, 0 <= probability <= 1 and 0 < stretch < frames, got "
@@ -62,7 +61,6 @@ class Objective:
     explosion: float = 3.0
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         names = ["backprop_steps", *(f.name for f in fields(self) if f.name.endswith("_weight"))]
         negative = [name for name in names if getattr(self, name) < 0]
         if negative or self.explosion <= 0:

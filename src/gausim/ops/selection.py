@@ -32,15 +32,12 @@ class Selection(ABC):
         """True for the kernels that are selected."""
 
     def __and__(self, other: "Selection") -> "Selection":
-        """Intersection with another selection."""
         return _Made(lambda scene: self(scene) & other(scene))
 
     def __or__(self, other: "Selection") -> "Selection":
-        """Union with another selection."""
         return _Made(lambda scene: self(scene) | other(scene))
 
     def __invert__(self) -> "Selection":
-        """Complement of this selection."""
         return _Made(lambda scene: ~self(scene))
 
 

@@ -141,12 +141,12 @@ def _carve_box(
     return VoxelHull(inside.reshape(grid.shape[:3]), grid[0, 0, 0], spacing)
 
 
-def farthest_points(points: Float[Tensor, "N 3"], count: int, *, start: int = 0) -> Tensor:
-    """Indices of ``count`` points by farthest-point sampling."""
+def farthest_points(points: Float[Tensor, "N 3"], count: int) -> Tensor:
+    """Indices of ``count`` points by farthest-point sampling, the first one first."""
     count = min(count, points.shape[0])
     chosen = torch.zeros(count, dtype=torch.long)
     distance = torch.full((points.shape[0],), float("inf"))
-    current = start
+    current = 0
     for i in range(count):
         chosen[i] = current
         distance = torch.minimum(distance, (points - points[current]).square().sum(-1))

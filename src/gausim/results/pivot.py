@@ -47,7 +47,6 @@ class Pivot:
     """Figures of a table by their place."""
 
     def __init__(self, results: Results) -> None:
-        """Indexes the table."""
         self.results = results
         self._entries: dict[Place, dict[str, list[Entry]]] = defaultdict(lambda: defaultdict(list))
         self._kinds: dict[str, dict[str, str]] = defaultdict(dict)

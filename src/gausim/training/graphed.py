@@ -41,7 +41,6 @@ class GraphedRollouts:
     """
 
     def __init__(self, model: nn.Module) -> None:
-        """Starts without a capture."""
         self._model = model
         self._kept: dict[object, tuple[object, Replay]] = {}  # what it holds for, and the capture
 

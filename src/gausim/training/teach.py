@@ -53,7 +53,6 @@ class Lesson:
     def __init__(
         self, learner: Learner, model: GausSim, tracks: Sequence[Track], settings: Teaching, seed: int
     ) -> None:
-        """Stores the tracked positions."""
         self._learner, self._model, self._settings = learner, model, settings
         self._scenes = [known.scene_id for known in tracks]
         self._numbers = [known.sequence_id for known in tracks]

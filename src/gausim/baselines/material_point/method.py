@@ -45,7 +45,6 @@ class TriPlaneField(nn.Module):
     """A smooth function of space: summed features of three planes, a hidden layer, ``outputs`` numbers, 0 at first."""
 
     def __init__(self, resolution: int, *, features: int = 32, hidden: int = 32, outputs: int = 1) -> None:
-        """Draws its parameters from the global generator."""
         super().__init__()
         # The features, ``resolution`` numbers along both axes of each.
         self.planes = Planes([resolution] * 3, features, combine=SUM)

@@ -61,7 +61,6 @@ class Body:
     """
 
     def __init__(self, rest: Float[Tensor, "N 3"]) -> None:
-        """Stores the units."""
         self.units = rest
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> Carried:
@@ -83,7 +82,7 @@ class Reference:
     moves = False
 
     def __init__(self, batch: SceneBatch, rest: Float[Tensor, "N 3"]) -> None:
-        """Stores the members, the rows of their units, and the units' centres of mass at ``rest``."""
+        """``rest`` are the centres of mass of the finest units."""
         self._members, self._spans, self._like, self.rest = batch.members, batch.levels[-1].spans, batch.rest, rest
 
     def carry(

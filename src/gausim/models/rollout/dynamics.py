@@ -26,12 +26,7 @@ class SceneDynamics:
     takes_hands: bool = True
 
     def __init__(
-        self,
-        model: GausSim,
-        scene_id: int = 0,
-        *,
-        energy_ceiling: float | None = None,
-        correction_scale: float = 1.0,
+        self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None, correction_scale: float = 1.0
     ) -> None:
         """Binds ``model`` to its scene ``scene_id``; the other arguments are those of :class:`SceneStepper`."""
         self.model, self.scene_id, self.energy_ceiling = model, scene_id, energy_ceiling
@@ -71,7 +66,6 @@ class MaterialDynamics(SceneDynamics):
     """
 
     def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
-        """Takes the arguments of :class:`SceneDynamics`."""
         shared = {id(part): part for part in (*model.scenes, *model.hierarchies)}  # large, and never changed
         model = copy.deepcopy(model, shared)
         super().__init__(model, scene_id, energy_ceiling=energy_ceiling)

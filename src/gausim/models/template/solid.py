@@ -110,18 +110,6 @@ class SolidBody:
         slopes = self.at(self.centres)[1].reshape(len(self.centres), -1)
         return (shares @ slopes / np.maximum(volume, 1e-30)[:, None]).reshape(len(rest), 9, -1), volume
 
-    def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
-
-        Returns:
-            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units, their
-            displacement gradients (N, 3, 3, M) [1 / scene units], and :meth:`strains`.
-        """
-        phi, slope = self.at(rest)
-        phi[pinned], slope[pinned] = 0, 0
-        values = np.maximum(self.values, 1e-4 * self.values[-1])
-        return values / values[0], phi, slope, self.strains(rest)
-
 
 def solid_body(
     kernels: np.ndarray,

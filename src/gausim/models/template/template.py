@@ -52,7 +52,6 @@ class PreparedTemplate:
     """The template of a batch between two updates of the parameters; in this base class the rest state."""
 
     def __init__(self, batch: SceneBatch) -> None:
-        """Stores where the members' units are."""
         self.spans, self.device = batch.levels[-1].spans, batch.rest.device
 
     def __call__(self, motion: UnitMotion) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3 3"] | None]:
@@ -75,27 +74,15 @@ class PreparedTemplate:
         return motion
 
     def overshoot(self, displacement: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The part of a displacement by an impulse that its frame does not reach (:meth:`ModalScene.overshoot`).
-
-        Raises:
-            NotImplementedError: the template has no energy.
-        """
+        """The part of a displacement by an impulse that its frame does not reach (:meth:`ModalScene.overshoot`)."""
         raise NotImplementedError("the rest state has no energy")
 
     def energy(self, motion: UnitMotion) -> Float[Tensor, " S"]:
-        """Energy of every member of the batch.
-
-        Raises:
-            NotImplementedError: the template has none.
-        """
+        """Energy of every member of the batch, of templates with :attr:`Template.has_energy`."""
         raise NotImplementedError("the rest state has no energy")
 
     def dissipated(self, motion: UnitMotion, previous: Float[Tensor, "N 3"]) -> Float[Tensor, " S"]:
-        """Energy that the damping takes from every member in a step from ``previous`` (t - 1) to the end of ``motion``.
-
-        Raises:
-            NotImplementedError: the template has no energy.
-        """
+        """Energy that damping takes from every member in a step from ``previous`` (t - 1) to the end of ``motion``."""
         raise NotImplementedError("the rest state has no energy")
 
     def correction_unit(self) -> Float[Tensor, " S"] | None:
@@ -142,10 +129,6 @@ class Template(nn.Module, ABC):
 
         See :class:`gausim.core.SmoothMotions`. Motion is tracked in them.
         """
-
-    def vibrations(self, scene_id: int) -> int | None:
-        """The number of the first modes of :meth:`basis` that vibrate by themselves; None for all."""
-        return None
 
 
 class PreparedScenes(PreparedTemplate):

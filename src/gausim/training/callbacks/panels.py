@@ -17,20 +17,23 @@ from gausim.training.dashboards import log_media
 from gausim.training.media import Clip, forget_media, safe_name, write_media
 from gausim.training.module import GausSimModule
 
+# Objects that are shown.
+MOST_OBJECTS = 4
+
 
 class Panels(Callback):
-    """Renders predictions of the first sequence of every object in its first training camera.
+    """Renders predictions of the first sequence of the first objects in its first training camera.
 
     Frames 0..``t_max`` of the plan are predicted, whatever the current T; unseen frames are not read. Videos and
     pictures go to ``panels/`` of the run and to every logger that shows media, errors as numbers to every logger. There
     is no effect on training.
     """
 
-    def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
-        """Renders the first ``objects`` every ``every_epochs`` epochs (0: never) and after the last."""
-        if every_epochs < 0 or objects < 1:
-            raise ConfigError(f"Panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}.")
-        self._every, self._objects = every_epochs, objects
+    def __init__(self, *, every_epochs: int = 5) -> None:
+        """Renders every ``every_epochs`` epochs (0: never) and after the last."""
+        if every_epochs < 0:
+            raise ConfigError(f"trainer.panel_epochs: expected at least 0, got {every_epochs}.")
+        self._every = every_epochs
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Removes the media of steps that a resumed run repeats."""
@@ -68,7 +71,7 @@ class Panels(Callback):
         for sequence, (scene_id, _) in enumerate(data.index.entries):
             first.setdefault(scene_id, sequence)
         frames = range((data.plan.t_max or 0) + 1 if data.plan else 0)
-        chosen = list(first.items())[: self._objects]
+        chosen = list(first.items())[:MOST_OBJECTS]
         return [data.index.sample(s, frames, data.objects[i].train_views[:1]).to(module.device) for i, s in chosen]
 
 

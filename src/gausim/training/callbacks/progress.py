@@ -105,10 +105,6 @@ def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float
 class Progress(RichProgressBar):
     """Lightning's rich progress bar with the metrics of training."""
 
-    def __init__(self, *, refresh_rate: int = 1, leave: bool = False) -> None:
-        """``refresh_rate`` in batches; ``leave`` keeps the bar of every epoch."""
-        super().__init__(refresh_rate=refresh_rate, leave=leave)
-
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """T, the loss against the static prediction's, and the motion energy."""
         stats = getattr(pl_module, "last_stats", {})
