@@ -114,7 +114,7 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pushed: Path, tmp_path: Path) -> None:
     out = tmp_path / "adapted"
     asked = [str(joint), "--data", str(pushed), "--sequences", "hard", "other_way", "--frames", "4"]
-    quick = ["--epochs", "6", "--set", "optimizer.initial_lr=0.01"]
+    quick = ["--epochs", "4", "--set", "optimizer.initial_lr=0.015"]
     assert adapt.main([*asked, "--out", str(out), *quick]) == 0
     found, source = weights(out), load_run(joint).module.model.state_dict()
     own = {name.removeprefix("model."): value for name, value in found.items() if name.startswith("model.")}

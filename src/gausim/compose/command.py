@@ -131,7 +131,8 @@ def run_dir() -> Path:
 
 def _check(words: Sequence[str], *, sweep: bool) -> None:
     """Checks every job before Hydra builds its logging, callbacks and launcher, and makes a directory."""
-    config = compose(_without_lists(words), with_hydra=True)
+    first = _without_lists(words)
+    config = compose(first, with_hydra=True)
     check_hydra(config.hydra)
     if not sweep and config.hydra.sweeper.get("params"):
         raise ConfigError(f"experiment={config.hydra.runtime.choices.experiment}: is several trainings, so add -m.")
@@ -139,7 +140,8 @@ def _check(words: Sequence[str], *, sweep: bool) -> None:
     if not jobs:
         raise ConfigError(f"{' '.join(words)}: expected at least one value of every key, so there is nothing to run.")
     for job in jobs:
-        check_hydra(compose(job, with_hydra=True).hydra)
+        if job != first:
+            check_hydra(compose(job, with_hydra=True).hydra)
         check_ablations(job)
 
 
