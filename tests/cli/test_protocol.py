@@ -130,7 +130,7 @@ def test_looks_are_declared_counted_and_said(run, capsys, monkeypatch) -> None:
     assert evaluate.main([str(run), "--test", "--trials", "5"]) == 0
     assert "test part: 5 trials declared; recorded in" in capsys.readouterr().out
     assert evaluate.main([str(run), "--test", "--trials", "6"]) == 0
-    assert "6 trials declared, look 2" in capsys.readouterr().out
+    assert "6 trials declared, test evaluation 2" in capsys.readouterr().out
     looks = read_looks(run / "evaluation" / "test.json")
     assert [look["trials"] for look in looks] == [5, 6] and looks[0]["date"] <= looks[1]["date"]
     assert looks[0]["sequences"] == {"toy": ["seq_001"]}

@@ -168,7 +168,7 @@ def test_friction_stops_what_slides_and_without_it_nothing_does() -> None:
         floor = replace(FLOOR, point=(0.0, 0.0, 0.0), friction=friction)
         scene = _block(free=True, gravity=(0.0, 0.0, FALL), floor=floor)
         model, push = _frozen(scene), torch.tensor([0.01, 0.0, 0.0]).double()
-        last = _steps(model, SimState(scene.means, scene.means - push), 40)[-1]
+        last = _steps(model, SimState(scene.means, scene.means - push), 28)[-1]
         speeds.append(float(_fractions(model) @ (last.positions - last.previous)[:, 0]))
     assert speeds[0] == pytest.approx(0.01, rel=0.05)
     assert abs(speeds[1]) < 1e-3

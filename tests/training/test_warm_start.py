@@ -35,7 +35,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 MODES = "model.simulator.template.modes=6"
-WARM = [MODES, "plan.warm_start.updates=60"]
+WARM = [MODES, "plan.warm_start.updates=30"]
 CHOICES = [
     ["model=gausim", *WARM],
     pytest.param(["model=gausim", *WARM, "supervision=points"], marks=pytest.mark.slow),

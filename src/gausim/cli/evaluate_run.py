@@ -168,7 +168,7 @@ def _look(
         for file in sorted(file for file in folder.iterdir() if file.is_file()):
             file.replace(folder / DEVELOPMENT / file.name)
     looks = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=sequences)
-    again = f", look {looks}" if looks > 1 else ""
+    again = f", test evaluation {looks}" if looks > 1 else ""
     print(f"test part: {trials} trials declared{again}; recorded in {path}")
     return {"part": TEST_PART, "trials": trials, "looks": looks}
 
