@@ -19,6 +19,8 @@ RUN ?= outputs/demo/seed_0
 DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Bytecode of what a command imports is made when it does; of everything that is installed it takes half a minute.
+INSTALL = $(BIN)/python -m pip install -q --no-compile -c constraints.txt
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
@@ -31,18 +33,19 @@ help: ## Show this text
 install: $(STAMP) ## Create .venv with the tested versions (again only after a change of pyproject.toml or constraints.txt)
 
 $(STAMP): pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	$(INSTALL) -e ".[dev]"
 	touch $@
 
 # What the demo needs, a fraction of it all; where everything is installed, that serves.
 $(DEMO_STAMP): pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[synth,view]"
+	$(INSTALL) -e ".[synth,view]"
 	touch $@
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "error: no python3.11 or python3 found. Install Python 3.11 to 3.13, or: make install PYTHON=/path/to/python" >&2; exit 1; }
 	"$(PYTHON)" -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), f"expected Python 3.11 to 3.13, got {sys.version.split()[0]}. Use make install PYTHON=/path/to/python3.11"'
 	"$(PYTHON)" -m venv $(VENV)
+	$(BIN)/python -m pip install -q --upgrade pip  # recent ones choose versions in half the time
 
 test: install ## Run the default tests (without the slow ones)
 	$(PYTEST) -m "not slow" $(ARGS)
@@ -58,7 +61,7 @@ test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	$(ONE_THREAD) $(BIN)/python -m pytest -p nbmake --nbmake --nbmake-timeout=600 notebooks
 
 docs: install results ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
-	$(BIN)/python -c "import material, mkdocstrings" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	$(BIN)/python -c "import material, mkdocstrings" 2>/dev/null || $(INSTALL) -e ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 results: install ## Make docs/results.md from its records (docs/results/, which `gausim report DIR --record` writes)
@@ -99,8 +102,9 @@ benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at ti
 
 demo: $(DEMO_DATA)/.made ## From nothing to a simulator that predicts: install, make an object, train, evaluate, and a page about it
 	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train data=demo plan.epochs=1
+	$(BIN)/gausim export outputs/demo/seed_0 --format page --out outputs/demo/seed_0/page.html & page=$$!
 	$(BIN)/gausim evaluate outputs/demo/seed_0
-	$(BIN)/gausim export outputs/demo/seed_0 --format page --out outputs/demo/seed_0/page.html
+	wait $$page
 	$(BIN)/gausim report outputs/demo/seed_0
 
 $(DEMO_DATA)/.made: | $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
