@@ -14,6 +14,8 @@ from torch import Tensor
 
 from gausim.kernels.jit import caching
 from gausim.kernels.operations import OPERATIONS, Operation, plain_forms
+from gausim.models.template.finite_strain import strain_pull
+from gausim.models.template.springs import spring_pull
 from gausim.ops.deformation import polar_rotation
 from gausim.ops.similarity import gaussian_taps, image_loss
 from gausim.render.draw import deformed_appearance
@@ -88,6 +90,13 @@ def loss(form: Callable[..., Any], *x: Tensor, window: int = 5, balance: float =
     return form(*x, gaussian_taps(window), balance=balance, scale=7.0)
 
 
+def spring_pull_of(form: Callable[..., Any], first: Tensor, second: Tensor, *x: Tensor) -> Any:
+    """Of springs, one of which is pressed to its least length at the end."""
+    offset = random(7, 3, seed=2).to(first)
+    second = torch.cat((second[:, :6], second[:, 6:] * 1e-5 - offset[6:]), 1)
+    return form(first, second, offset, offset.norm(dim=-1), *x)
+
+
 Form, Case = Callable[..., Any], tuple[Operation[..., Any], Callable[..., Any], tuple[Tensor, ...]]
 SIZES = [(17, 23, 5), (6, 40, 5), (33, 7, 5), (5, 5, 5), (9, 8, 3), (21, 11, 11)]  # height, width, window
 BOXES = [(slice(10, 20), slice(12, 30)), (slice(0, 9), slice(25, 38)), (slice(30, 31), slice(3, 4))]
@@ -98,6 +107,9 @@ CASES: dict[str, Case] = {
     **{f"image_loss-box-{i}": (image_loss, loss, pictures(33, 40, box)) for i, box in enumerate(BOXES)},
     **{f"image_loss-pixel-{i}-{r}-{c}": (image_loss, loss, pixel(i, r, c)) for i, r, c in CORNERS},
     **{f"deformed_appearance-{d}": (deformed_appearance, appearance, deformed(d)) for d in range(4)},
+    "strain_pull": (strain_pull, lambda form, *x: form(*x),
+                    (*0.3 * random(2, 4, 5, 3, 3), random(5, 2, seed=1).exp(), random(1)[0])),
+    "spring_pull": (spring_pull, spring_pull_of, (*0.3 * random(2, 4, 7, 3), random(7, seed=1).exp(), random(1)[0])),
     "deformed_appearance-trained": (deformed_appearance, partial(appearance, trained=True), deformed(1)),
 }  # fmt: skip
 

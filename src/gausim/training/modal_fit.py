@@ -25,10 +25,8 @@ from gausim.training.optimizers import OptimizerSettings, set_rates
 
 # Predicted frames in the first update.
 SHORTEST = 2
-# Change by the last correction of a step, in sizes of the motion, up to which its inverse serves the next update, too.
-SOLVED = 0.003
-# Inverses of the steps of rollouts, by frame.
-Inverses = dict[int, Tensor]
+# Steps of rollouts, by frame.
+Steps = dict[int, Solved]
 FALLING = CosineSchedule(warmup=0.0)
 
 
@@ -42,26 +40,19 @@ class KnownMotion:
     after: Float[Tensor, "T B M"]
     load: Float[Tensor, "T B N 12"] | None = None  # of the units, as in UnitMotion
 
-    def distances(self, part: ModalScene, inverses: Inverses | None = None) -> Iterator[Float[Tensor, " B"]]:
+    def distances(self, part: ModalScene, kept: Steps | None = None) -> Iterator[Float[Tensor, " B"]]:
         """Squared distances of the rollouts of a template from the motion, in squared sizes, frame by frame.
 
-        ``inverses`` are those of rollouts that were nearly the same; they are renewed.
+        ``kept`` are the steps of rollouts that were nearly the same; they are renewed.
         """
-        before, now, inverses = self.before, self.now, {} if inverses is None else inverses
+        before, now, kept = self.before, self.now, {} if kept is None else kept
         for frame, true in enumerate(self.after):
             load = None if self.load is None else self.load[frame]
-            step, known = None, inverses.pop(frame, None)
-            if known is not None:
-                step = self._if_solved(part.solve(now, before, load, known))
-            if step is None:
-                step = part.solve(now, before, load)
-            if self._if_solved(step) is not None:
-                inverses[frame] = step.inverse
+            step = part.solve(now, before, load, kept.get(frame))
+            if bool(step.after.isfinite().all()):
+                kept[frame] = Solved(step.after.detach(), step.bend, step.inverse)
             before, now = now, step.after
             yield (now - true).square().sum(-1) / self.size.square()
-
-    def _if_solved(self, step: Solved) -> Solved | None:
-        return step if bool((step.change.norm(dim=-1) <= SOLVED * self.size).all()) else None
 
     def error(self, part: ModalScene) -> Float[Tensor, ""]:
         """Mean distance of the rollouts of a template from the motion, in sizes; infinite where it is not finite."""
@@ -100,7 +91,7 @@ def fit(
     trained = {name: [p for p in own if p.requires_grad] for name, own in groups.items()}
     weights = [p for own in trained.values() for p in own]
     optimizer, least, kept = settings.build(trained), math.inf, [p.detach().clone() for p in weights]
-    inverses: dict[int, Inverses] = {}
+    kept_steps: dict[int, Steps] = {}
     last: dict[int, Tensor] = {}
     for update in range(updates):
         steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / growing))
@@ -111,8 +102,8 @@ def fit(
         for scene_id, known in motions:
             motion, part = known(steps), model.modal_scene(scene_id)
             if scene_id not in last or not torch.equal(last[scene_id], motion.after[0]):  # of other rollouts
-                inverses[scene_id], last[scene_id] = {}, motion.after[0]
-            loss = torch.stack([d.mean() for d in motion.distances(part, inverses[scene_id])]).mean() / len(motions)
+                kept_steps[scene_id], last[scene_id] = {}, motion.after[0]
+            loss = torch.stack([d.mean() for d in motion.distances(part, kept_steps[scene_id])]).mean() / len(motions)
             if bool(torch.isfinite(loss)):
                 loss.backward()
             total += float(loss.detach())

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gausim.kernels.operations import operation
 from gausim.models.template.grid import FIRST, SECOND
 
 
@@ -24,7 +25,33 @@ class Strained(NamedTuple):
     """The body in a state."""
 
     gradient: Float[Tensor, "S N 3 3"]  # of the displacement, H
-    strain: Float[Tensor, "S N 3 3"]  # Green's strain E = (H + H^T + H^T H) / 2
+
+    @property
+    def strain(self) -> Float[Tensor, "S N 3 3"]:
+        """Green's strain E = (H + H^T + H^T H) / 2."""
+        return (self.gradient + self.gradient.mT + self.gradient.mT @ self.gradient) / 2
+
+
+@operation("gausim.kernels.elastic:strain_pull")
+def strain_pull(
+    first: Float[Tensor, "S N 3 3"],
+    second: Float[Tensor, "S N 3 3"],
+    moduli: Float[Tensor, "N 2"],
+    damping: Tensor | float,
+) -> Float[Tensor, "S N 3 3"]:
+    """S + H S - sigma(sym H) with the means H and S of both displacement gradients and stresses.
+
+    ``moduli`` are 2 mu and lambda times volume; ``damping`` times the growth of strain adds to the mean strain.
+    """
+    one = torch.eye(3, dtype=first.dtype, device=first.device)
+
+    def stress(strain: Tensor) -> Tensor:
+        pressure = moduli[:, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
+        return moduli[:, 0, None, None] * strain + pressure[..., None, None] * one
+
+    before, after, mean = Strained(first).strain, Strained(second).strain, (first + second) / 2
+    whole = stress((before + after) / 2 + damping * (after - before))
+    return whole + mean @ whole - stress((mean + mean.mT) / 2)
 
 
 class FiniteStrain(nn.Module):
@@ -41,6 +68,7 @@ class FiniteStrain(nn.Module):
     volume: Tensor  # w of the cells near each unit (N,)
     measures: Tensor  # derivatives of the seven measures of sym(F^T H) with respect to F and H (9, 7 x 9)
     moduli: Tensor  # of shear and of volume in the energy of each measure (2, 7)
+    lame: Tensor  # 2 mu and lambda (2,)
 
     def __init__(self, gradients: np.ndarray, volume: np.ndarray, *, scale: float = 1.0) -> None:
         """Takes displacement gradients (N, 9, M) of the modes and volumes (N,), in multiples of 1 / ``scale``."""
@@ -50,6 +78,7 @@ class FiniteStrain(nn.Module):
         moduli = torch.tensor([6 * [2 * SECOND] + [0.0], 6 * [0.0] + [FIRST]])
         self.register_buffer("measures", _measures(), persistent=False)
         self.register_buffer("moduli", moduli, persistent=False)
+        self.register_buffer("lame", torch.tensor([2 * SECOND, FIRST]), persistent=False)
 
     def reference_strain(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
         """S of every unit."""
@@ -59,7 +88,7 @@ class FiniteStrain(nn.Module):
         """The body in a state of the modes; ``reference`` is that of :meth:`reference_strain`."""
         gradient = (z @ self.gradients.mT).unflatten(-1, (-1, 3, 3))
         gradient = gradient if reference is None else gradient + reference
-        return Strained(gradient, (gradient + gradient.mT + gradient.mT @ gradient) / 2)
+        return Strained(gradient)
 
     def between(
         self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0
@@ -69,9 +98,8 @@ class FiniteStrain(nn.Module):
         The mean of both stresses acts on the mean of both deformations (Simo and Tarnow 1992), and more by ``damping``
         times the growth of strain (Armero and Romero 2001), which no rotation changes.
         """
-        gradient, stress = self._means(first, second, factor, damping)
-        beyond = stress + gradient @ stress - self._stress((gradient + gradient.mT) / 2, factor)
-        return -(beyond.flatten(1) @ self.gradients)
+        moduli = self.volume[:, None] * factor * self.lame
+        return -(strain_pull(first.gradient, second.gradient, moduli, damping).flatten(1) @ self.gradients)
 
     def stiffening(
         self, first: Strained, second: Strained, factor: Float[Tensor, "N 2"], damping: Tensor | float = 0.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -12,6 +13,9 @@ from gausim.models.template.finite_strain import hooke
 
 # Least part of an impulse that damping leaves in its first frame.
 LEAST_LEFT = 0.1
+# A step of a fit is solved when a correction is below this part of its motion, its loss gradient likewise; most
+# corrections; ratio of two corrections in a row from which on stiffness is computed again.
+SOLVED, SOLVED_GRADIENT, MOST, SLOW = 3e-3, 3e-2, 30, 0.4
 
 
 class NonlinearForce(Protocol):
@@ -42,8 +46,38 @@ class Solved(NamedTuple):
     """A solved step."""
 
     after: Float[Tensor, "S M"]  # z_{t+1}
-    inverse: Float[Tensor, "S M M"]  # with which the corrections were computed, the last one at least
-    change: Float[Tensor, "S M"]  # by the last correction
+    bend: Float[Tensor, "S M"]  # z_{t+1} - 2 z_t + z_{t-1}, nearly
+    inverse: Float[Tensor, "S M M"]  # with which it was solved
+
+
+class _Correction(torch.autograd.Function):
+    """A last correction ``inverse @ residual``; the residual gets A^-T of the loss gradient, A minus its derivative."""
+
+    @staticmethod
+    def forward(ctx: Any, residual: Tensor, inverse: Tensor, adjoint: Callable[[Tensor], Tensor]) -> Tensor:
+        ctx.adjoint = adjoint
+        return _product(inverse, residual)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> Any:
+        return ctx.adjoint(slope), None, None
+
+
+def _product(matrix: Float[Tensor, "S M M"], vector: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _inverse_adjoint(slope: Tensor, apply: Callable[[Tensor], Tensor], inverse: Tensor) -> Float[Tensor, "S M"]:
+    """A^-T ``slope`` of A^T = ``apply``, by corrections with nearly the inverse of A, while they become smaller."""
+    change = found = _product(inverse.mT, slope)
+    for _ in range(MOST):
+        last, change = change, _product(inverse.mT, slope - apply(found))
+        shrinks = change.square().sum(-1) < last.square().sum(-1)
+        found = found + shrinks[:, None] * change
+        if not bool((shrinks & (change.norm(dim=-1) > SOLVED_GRADIENT * found.norm(dim=-1))).any()):
+            break
+    return found
 
 
 class ModalScene:
@@ -60,6 +94,7 @@ class ModalScene:
     # misses how far the body turns within the frame: where it is far stiffer than inertia, corrections with it alone do
     # not converge. With the others, between the ends of the frame, they do.
     corrections = 3
+    solved = SOLVED
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -107,38 +142,77 @@ class ModalScene:
 
         Resistance to growth is part of f. Without damping and load a step conserves :meth:`energy` exactly.
         """
-        return self.solve(z, previous, load).after
+        law, factor, damping = self.nonlinear, self.factor, self.growth
+        speed, bend = z - previous, torch.zeros_like(z)
+        reference, force, linear = self._known(z, speed, load)
+        first = law.strain_state(z - speed / 2, reference)
+        used = z.new_zeros(0)
+        for correction in range(self.corrections):
+            second = law.strain_state(z + (speed + bend) / 2, reference)
+            if correction < self.corrections - 1:
+                used = self._inverse(
+                    linear, *((first, second) if correction else 2 * (law.strain_state(z, reference),))
+                )
+            bend = bend + _product(used, force + law.between(first, second, factor, damping) - bend @ linear.mT)
+        return z + speed + bend
+
+    def _known(self, z: Tensor, speed: Tensor, load: Tensor | None) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Strain of the reference, force on the body at ``speed`` without what is nonlinear, and linear operator."""
+        reference, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
+        if load is not None:
+            reference, force = self.nonlinear.reference_strain(load[..., 3:]), force + self.force(load)
+        return reference, force, self.inertia + self.stiffness / 4 + self.damping / 2
+
+    @torch.no_grad()
+    def _inverse(self, linear: Float[Tensor, "M M"], first: Any, second: Any) -> Float[Tensor, "S M M"]:
+        operator = linear + self.nonlinear.stiffening(first, second, self.factor, self.growth) / 4
+        return torch.linalg.inv_ex(operator)[0]  # without waiting for a device
 
     def solve(
         self,
         z: Float[Tensor, "S M"],
         previous: Float[Tensor, "S M"],
         load: Float[Tensor, "S N 12"] | None = None,
-        inverse: Float[Tensor, "S M M"] | None = None,
+        near: Solved | None = None,
     ) -> Solved:
-        """The step of :meth:`after`, solved by corrections; loss gradients are theirs.
+        """The step of :meth:`after`, solved to a tolerance; loss gradients are those of the implicit function.
 
-        ``inverse`` is that of nearly the same step. With it no stiffness is computed, which takes most of the time.
+        ``near`` is nearly the same step. Stiffness, which takes most of the time, is computed again only where
+        corrections become smaller too slowly.
         """
-        law, factor, damping = self.nonlinear, self.factor, self.growth
-        speed, bend = z - previous, torch.zeros_like(z)
-        reference, force = None, -(z @ self.stiffness.mT) - speed @ self.damping.mT
-        if load is not None:
-            reference, force = law.reference_strain(load[..., 3:]), force + self.force(load)
-        linear = self.inertia + self.stiffness / 4 + self.damping / 2
-        first = law.strain_state(z - speed / 2, reference)
-        given, used = inverse is not None, z.new_zeros(0) if inverse is None else inverse
-        for correction in range(self.corrections):
-            second = law.strain_state(z + (speed + bend) / 2, reference)
-            if correction < self.corrections - 1 and not given:
-                with torch.no_grad():
-                    ends = (first, second) if correction else 2 * (law.strain_state(z, reference),)
-                    operator = linear + law.stiffening(*ends, factor, damping) / 4
-                    used = torch.linalg.inv_ex(operator)[0]  # without waiting for a device
-            nonlinear = law.between(first, second, factor, damping)
-            change = (used @ (force + nonlinear - bend @ linear.mT)[..., None])[..., 0]
-            bend = bend + change
-        return Solved(z + speed + bend, used, change.detach())
+        law, factor, damping, speed = self.nonlinear, self.factor, self.growth, z - previous
+        reference, force, linear = self._known(z, speed, load)
+        with torch.no_grad():
+            first, slow = law.strain_state(z - speed / 2, reference), False
+            bend, used = (torch.zeros_like(z), None) if near is None else (near.bend, near.inverse)
+            least, last = self.solved * speed.norm(dim=-1), None
+            for correction in range(MOST):
+                second = law.strain_state(z + (speed + bend) / 2, reference)
+                if used is None or slow:
+                    used = self._inverse(
+                        linear, *((first, second) if correction else 2 * (law.strain_state(z, reference),))
+                    )
+                change = _product(used, force + law.between(first, second, factor, damping) - bend @ linear.mT)
+                bend, size = bend + change, change.norm(dim=-1)
+                if bool((size <= torch.maximum(least, self.solved * (speed + bend).norm(dim=-1))).all()):
+                    break
+                slow, last = last is not None and not bool((size <= SLOW * last).all()), size
+            assert used is not None
+            inverse = used
+
+        def adjoint(slope: Tensor) -> Tensor:
+            """A^-T of a loss gradient, A minus the residual's derivative."""
+
+            def apply(found: Tensor) -> Tensor:
+                return found @ linear - torch.autograd.grad(pull, moved, found, retain_graph=True)[0]
+
+            return _inverse_adjoint(slope, apply, inverse)
+
+        moved = bend.clone().requires_grad_(torch.is_grad_enabled())
+        first, second = (law.strain_state(place, reference) for place in (z - speed / 2, z + (speed + moved) / 2))
+        pull = law.between(first, second, factor, damping)
+        left = force + pull - bend @ linear.mT
+        return Solved(z + speed + bend + _Correction.apply(left, inverse, adjoint), bend, inverse)
 
     def derivatives(
         self, previous: Float[Tensor, "S M"], z: Float[Tensor, "S M"], after: Float[Tensor, "S M"]

@@ -10,6 +10,11 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from gausim.kernels.operations import operation
+
+# Least square of a spring's length over that at rest.
+LEAST_SQUARE = 1e-6
+
 
 def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
     """Distinct pairs (E, 2) of points (N, 3), of which one is among the other's nearest neighbours."""
@@ -24,9 +29,46 @@ class Stretched(NamedTuple):
     """Springs in a state."""
 
     change: Float[Tensor, "S E 3"]  # d - d_0 [scene units]
-    length: Float[Tensor, "S E"]  # |d|
-    stretch: Float[Tensor, "S E"]  # |d| - |d_0|, without the cancellation of a difference
-    along: Float[Tensor, "S E"]  # d_0 . (d - d_0)
+    offset: Float[Tensor, "E 3"]  # d_0 [scene units]
+    rest: Float[Tensor, " E"]  # |d_0| [scene units]
+
+    @property
+    def along(self) -> Float[Tensor, "S E"]:
+        """d_0 . (d - d_0)."""
+        return (self.offset * self.change).sum(-1)
+
+    @property
+    def grown(self) -> Float[Tensor, "S E"]:
+        """|d|^2 - |d_0|^2."""
+        return 2 * self.along + self.change.square().sum(-1)
+
+    @property
+    def length(self) -> Float[Tensor, "S E"]:
+        """|d|."""
+        squared = self.rest.square()
+        return (squared + self.grown).clamp_min(LEAST_SQUARE * squared).sqrt()
+
+    @property
+    def stretch(self) -> Float[Tensor, "S E"]:
+        """|d| - |d_0|, without the cancellation of a difference."""
+        return self.grown / (self.length + self.rest)
+
+
+@operation("gausim.kernels.elastic:spring_pull")
+def spring_pull(
+    first: Float[Tensor, "S E 3"],
+    second: Float[Tensor, "S E 3"],
+    offset: Float[Tensor, "E 3"],
+    length: Float[Tensor, " E"],
+    stiffness: Float[Tensor, " E"],
+    damping: Tensor | float,
+) -> Float[Tensor, "S E 3"]:
+    """Mean pull of every spring from one state to another, beyond the linear one; see :meth:`Springs.between`."""
+    before, after = (Stretched(change, offset, length) for change in (first, second))
+    shrink = 2 * _tension(before, after, damping) / (before.length + after.length)
+    linear = (before.along + after.along) / 2 / length.square()
+    pull = shrink[..., None] * (first + second) / 2 + (shrink - linear)[..., None] * offset
+    return stiffness[:, None] * pull
 
 
 class Springs(nn.Module):
@@ -72,10 +114,7 @@ class Springs(nn.Module):
         """Every spring in a state of the modes; ``reference`` is that of :meth:`reference_strain`."""
         change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
         change = change if reference is None else change + reference
-        squared, along = self.length.square(), (self.offset * change).sum(-1)
-        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
-        length = (squared + grown).clamp_min(1e-6 * squared).sqrt()
-        return Stretched(change, length, grown / (length + self.length), along)
+        return Stretched(change, self.offset, self.length)
 
     def stiffening(
         self, first: Stretched, second: Stretched, factor: Tensor | float = 1.0, damping: Tensor | float = 0.0,
@@ -119,11 +158,9 @@ class Springs(nn.Module):
         by ``damping`` times the growth of its length (Armero and Romero 2001), which no rotation changes.
         ``factor`` is on the stiffness, one number or one per spring (E,).
         """
-        change, along = (first.change + second.change) / 2, (first.along + second.along) / 2
-        shrink = 2 * _tension(first, second, damping) / (first.length + second.length)
-        nonlinear = shrink[..., None] * change + (shrink - along / self.length.square())[..., None] * self.offset
-        nonlinear = (factor * self.stiffness)[:, None] * nonlinear
-        return -(nonlinear.flatten(-2) @ self.modes)
+        k = factor * self.stiffness
+        pull = spring_pull(first.change, second.change, self.offset, self.length, k, damping)
+        return -(pull.flatten(-2) @ self.modes)
 
     def dissipated(
         self, first: Stretched, second: Stretched, factor: Tensor | float, damping: Tensor | float
