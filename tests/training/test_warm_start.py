@@ -85,7 +85,7 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(
         model.attributes[0].copy_(0.5 * torch.randn(attributes.shape, generator=draws))
         part, z = model.modal_scene(0), [start, 1.2 * start]
         for _ in range(6):
-            z.append(part.after(z[-1], z[-2]))
+            z.append(part.solve(z[-1], z[-2]).after)
         model.attributes[0].copy_(attributes)
     true = torch.stack(z)
     size = modal_fit.size_of(true.movedim(0, 1))

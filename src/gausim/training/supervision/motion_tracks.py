@@ -137,23 +137,24 @@ class MotionTracker:
         prior, damping = self._prior * unit, DAMPING
 
         def compare(place: Tensor) -> tuple[Tensor, Tensor]:
+            """The error as part of a graph, and the leaf of that."""
             place = place.detach().requires_grad_()
             off = _shrunk(self._drawn(sample, place[None], carried), factor) - target
-            error = 0.5 * (off.square().sum() + prior * place.square().sum())
-            return error.detach(), torch.autograd.grad(error, place)[0]
+            return 0.5 * (off.square().sum() + prior * place.square().sum()), place
 
-        error, slope = compare(place)
-        for _ in range(self._iterations):
-            tried = place - curvature.step(slope, prior + damping * unit)
-            found, steepness = compare(tried)
-            gain = float(1 - found / error)
-            if gain > 0:
-                place, error, slope, damping = tried, found, steepness, damping * LESS
-                if gain < LEAST_GAIN:
-                    break
-            else:
+        error, leaf = compare(place)
+        (slope,) = torch.autograd.grad(error, leaf)
+        for iteration in range(self._iterations):
+            found, leaf = compare(place - curvature.step(slope, prior + damping * unit))
+            gain = float(1 - found.detach() / error.detach())
+            if gain <= 0:
                 damping *= MORE
-        return place
+                continue
+            place, error, damping = leaf.detach(), found, damping * LESS
+            if gain < LEAST_GAIN or iteration == self._iterations - 1:
+                break
+            (slope,) = torch.autograd.grad(error, leaf)  # only for a step that follows
+        return place.detach()
 
     def _drawn(
         self, sample: SequenceSample, places: Float[Tensor, "B M"], carried: Carried | None = None
