@@ -39,13 +39,13 @@ from gausim.training.supervision.points import PointSupervision
 # faint pixels shows.
 DIFFERENCE = 0.01
 # Part of the error that a step has to take away for another one to follow on the same images.
-LEAST_GAIN = 0.01
+LEAST_GAIN = 0.03
 TINY = 1e-12
 # Levenberg and Marquardt's damping, in mean eigenvalues of the curvature: its start, and factors after a step that is
 # accepted and after one that is not.
 DAMPING, LESS, MORE = 0.1, 1 / 3, 4.0
 # Fewest pixels along an image's side.
-LEAST_SIDE = 8
+LEAST_SIDE = 32
 
 
 @dataclass(frozen=True, eq=False)
