@@ -13,7 +13,7 @@ from helpers.simulators import LEVELS
 from helpers.toy_object import toy_scene, write_toy_object
 from helpers.toy_runs import rows
 
-from gausim.cli import evaluate
+from gausim.cli import evaluate, training_run
 from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
@@ -75,6 +75,17 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(arguments, c
     table = load_results(RUN / "evaluation" / "metrics.json").table
     found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim", "points")}
     assert float(watched[-1]["error_unseen"]) == pytest.approx(found["unseen", "error_3d_ratio"], rel=1e-3)
+
+
+def test_a_time_limit_that_the_start_spends_is_named() -> None:
+    facts = {"epochs": 1, "optimizer_steps": 1, "last_epoch": {}}
+    sentences = training_run._result(facts, {"max_minutes": 0.5, "epochs": 30})
+    assert sentences == [
+        "Trained for 1 epoch (1 step).",
+        "Most of plan.max_minutes=0.5 went into the start. Raise this limit.",
+    ]
+    for plan in ({"max_minutes": None, "epochs": 30}, {"max_minutes": 0.5, "epochs": 1}):
+        assert training_run._result(facts, plan) == sentences[:1]
 
 
 def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from gausim.doctor.examine import examine
 from gausim.doctor.text import findings_text
 from gausim.runs.directory import RunDirectory
 
+FEW_STEPS = 10  # a time limit that leaves fewer is too short
+
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> None:
     """Trains into a run directory locked by this process, and evaluates the run if configured."""
@@ -30,7 +33,7 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> None:
             if is_first():
                 evaluable = not cfg.evaluate and job.data.has_videos
                 commands = [["evaluate", run.path], ["report", run.path]] if evaluable else []
-                end(_result(facts), "run", run.path, *commands)
+                end(_result(facts, job.config.plan), "run", run.path, *commands)
     if cfg.evaluate:
         _evaluate(run)
 
@@ -51,13 +54,15 @@ def _evaluate(run: RunDirectory) -> None:
         )
 
 
-def _result(facts: dict[str, Any]) -> list[str]:
+def _result(facts: dict[str, Any], plan: Mapping[str, Any]) -> list[str]:
     """Sentences on the training time, the error on training frames and whether it falls, and faults of the data."""
     more = [
         f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
         "`gausim doctor ROOT` has the remedy."
         for fault in facts.get("data_faults", ())
     ]
+    if plan.get("max_minutes") and facts["epochs"] < (plan.get("epochs") or 0) and facts["optimizer_steps"] < FEW_STEPS:
+        more.append(f"Most of plan.max_minutes={plan['max_minutes']:g} went into the start. Raise this limit.")
     excess = facts["last_epoch"].get("excess_static")
     counts = [
         f"{n} {unit}{'s' * (n != 1)}" for n, unit in ((facts["epochs"], "epoch"), (facts["optimizer_steps"], "step"))
