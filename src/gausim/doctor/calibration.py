@@ -167,8 +167,8 @@ def _readings(evidence: Evidence) -> list[_Reading]:
 
 def _fit(evidence: Evidence, cameras: Cameras) -> float:
     item = evidence.first[0]
-    masks, drawn = item.alpha[0] / np.float32(255), evidence.drawn(item, cameras).alpha
-    return float(np.mean([overlap(mask, alpha) for mask, alpha in zip(masks, drawn, strict=True)]))
+    drawn = evidence.drawn(item, cameras).alpha
+    return float(np.mean([overlap(mask, alpha) for mask, alpha in zip(item.masks, drawn, strict=True)]))
 
 
 def _read(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -216,7 +216,7 @@ _POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [
 def _another_lens(evidence: Evidence) -> _Reading:
     """The same poses with the focal length at which silhouettes have the right size."""
     item = evidence.first[0]
-    masks, cameras = item.alpha[0] / np.float32(255), item.cameras
+    masks, cameras = item.masks, item.cameras
     lenses = cameras.Ks.clone()
     for _ in range(_ROUNDS):
         drawn = evidence.drawn(item, replace(cameras, Ks=lenses)).alpha

@@ -60,6 +60,11 @@ class Watched:
         """Mean of the colours over black, 0 to 1."""
         return self.rgb.mean(-1, dtype=np.float32) / np.float32(255)
 
+    @property
+    def masks(self) -> Float[np.ndarray, "V h w"]:
+        """The foreground of frame 0, 0 to 1."""
+        return self.alpha[0] / np.float32(255)
+
 
 @dataclass(eq=False)
 class Evidence:
@@ -85,7 +90,7 @@ class Evidence:
     def drawn(self, item: Watched, cameras: Cameras) -> Silhouettes:
         """The rest scene rendered in cameras, a free body where it is in frame 0 of ``item``."""
         assert self.scene is not None
-        return draw_silhouettes(self.scene, cameras, item.alpha[0] / np.float32(255) if self.free else None)
+        return draw_silhouettes(self.scene, cameras, item.masks if self.free else None)
 
     @cached_property
     def rest(self) -> tuple[Silhouettes, ...] | None:

@@ -116,8 +116,7 @@ def _first_overlaps(evidence: Evidence) -> dict[str, float]:
     for s, item in enumerate(evidence.first):
         values = [1.0]
         if item in alike:
-            masks = item.alpha[0] / np.float32(255)
-            values.append(float(np.median([overlap(a, b) for a, b in zip(masks, usual, strict=True)])))
+            values.append(float(np.median([overlap(a, b) for a, b in zip(item.masks, usual, strict=True)])))
         if best > _AT_REST / 2:  # a smaller one is due to the calibration
             values.append(aligned[s] / best)
         found[item.name] = min(values)

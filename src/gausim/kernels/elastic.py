@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gausim.kernels.jit import FINITE_MATH_OFF, KERNEL
-from gausim.kernels.operations import array
+from gausim.kernels.operations import LEAST_SQUARE, array
 
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-LEAST_SQUARE = np.float32(1e-6)  # of a spring's length over that at rest
+LEAST = np.float32(LEAST_SQUARE)
 
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
@@ -96,8 +96,8 @@ def spring_forces(first, second, offset, length, stiffness, damping, slope, out,
             along_f, along_g = o[0] * f[0] + o[1] * f[1] + o[2] * f[2], o[0] * g[0] + o[1] * g[1] + o[2] * g[2]
             grown_f = TWO * along_f + f[0] * f[0] + f[1] * f[1] + f[2] * f[2]
             grown_g = TWO * along_g + g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
-            length_f = np.sqrt(max(squared + grown_f, LEAST_SQUARE * squared))
-            length_g = np.sqrt(max(squared + grown_g, LEAST_SQUARE * squared))
+            length_f = np.sqrt(max(squared + grown_f, LEAST * squared))
+            length_g = np.sqrt(max(squared + grown_g, LEAST * squared))
             stretch_f, stretch_g = grown_f / (length_f + length[e]), grown_g / (length_g + length[e])
             both = ONE / (length_f + length_g)
             shrink = TWO * (early * stretch_f + late * stretch_g) * both
@@ -116,10 +116,10 @@ def spring_forces(first, second, offset, length, stiffness, damping, slope, out,
             by_damping += k * across * TWO * (stretch_g - stretch_f) * both
             # Derivatives of length and stretch along d; equal but for springs that are held at their least length.
             longer_f, more_f = ONE / length_f, ONE / length_f
-            if squared + grown_f < LEAST_SQUARE * squared:
+            if squared + grown_f < LEAST * squared:
                 longer_f, more_f = ZERO, TWO / (length_f + length[e])
             longer_g, more_g = ONE / length_g, ONE / length_g
-            if squared + grown_g < LEAST_SQUARE * squared:
+            if squared + grown_g < LEAST * squared:
                 longer_g, more_g = ZERO, TWO / (length_g + length[e])
             on_f = across * both * (TWO * early * more_f - shrink * longer_f)
             on_g = across * both * (TWO * late * more_g - shrink * longer_g)

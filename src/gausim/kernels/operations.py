@@ -23,6 +23,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 # Constants of SSIM in both of its forms: (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1.
 SSIM_C1, SSIM_C2 = 1e-4, 9e-4
+LEAST_SQUARE = 1e-6  # of a spring's length over that at rest, in both forms of its force
 OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,20 +14,27 @@ from gausim.kernels.operations import operation
 from gausim.models.template.grid import FIRST, SECOND
 
 
-def hooke(strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
-    """2 mu s E + lambda b tr(E) I of strains E, s and b the ``factor`` on stiffness of shear and of volume."""
+def lame(factor: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
+    """2 mu s and lambda b, s and b the ``factor`` on stiffness of shear and of volume."""
     shear, bulk = factor.unbind(-1)
-    pressure = FIRST * bulk * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.stack((2 * SECOND * shear, FIRST * bulk), -1)
+
+
+def stress(strain: Float[Tensor, "*S N 3 3"], moduli: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
+    """Hooke's law of strains E, 2 mu E + lambda tr(E) I, with the ``moduli`` 2 mu and lambda."""
+    double, first = moduli.unbind(-1)
+    pressure = first * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
     one = torch.eye(3, dtype=strain.dtype, device=strain.device)
-    return 2 * SECOND * shear[:, None, None] * strain + pressure[..., None, None] * one
+    return double[:, None, None] * strain + pressure[..., None, None] * one
 
 
-class Strained(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Strained:
     """The body in a state."""
 
     gradient: Float[Tensor, "S N 3 3"]  # of the displacement, H
 
-    @property
+    @cached_property
     def strain(self) -> Float[Tensor, "S N 3 3"]:
         """Green's strain E = (H + H^T + H^T H) / 2."""
         return (self.gradient + self.gradient.mT + self.gradient.mT @ self.gradient) / 2
@@ -43,15 +51,9 @@ def strain_pull(
 
     ``moduli`` are 2 mu and lambda times volume; ``damping`` times the growth of strain adds to the mean strain.
     """
-    one = torch.eye(3, dtype=first.dtype, device=first.device)
-
-    def stress(strain: Tensor) -> Tensor:
-        pressure = moduli[:, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
-        return moduli[:, 0, None, None] * strain + pressure[..., None, None] * one
-
     before, after, mean = Strained(first).strain, Strained(second).strain, (first + second) / 2
-    whole = stress((before + after) / 2 + damping * (after - before))
-    return whole + mean @ whole - stress((mean + mean.mT) / 2)
+    whole = stress((before + after) / 2 + damping * (after - before), moduli)
+    return whole + mean @ whole - stress((mean + mean.mT) / 2, moduli)
 
 
 class FiniteStrain(nn.Module):
@@ -68,7 +70,6 @@ class FiniteStrain(nn.Module):
     volume: Tensor  # w of the cells near each unit (N,)
     measures: Tensor  # derivatives of the seven measures of sym(F^T H) with respect to F and H (9, 7 x 9)
     moduli: Tensor  # of shear and of volume in the energy of each measure (2, 7)
-    lame: Tensor  # 2 mu and lambda (2,)
 
     def __init__(self, gradients: np.ndarray, volume: np.ndarray, *, scale: float = 1.0) -> None:
         """Takes displacement gradients (N, 9, M) of the modes and volumes (N,), in multiples of 1 / ``scale``."""
@@ -78,7 +79,6 @@ class FiniteStrain(nn.Module):
         moduli = torch.tensor([6 * [2 * SECOND] + [0.0], 6 * [0.0] + [FIRST]])
         self.register_buffer("measures", _measures(), persistent=False)
         self.register_buffer("moduli", moduli, persistent=False)
-        self.register_buffer("lame", torch.tensor([2 * SECOND, FIRST]), persistent=False)
 
     def reference_strain(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
         """S of every unit."""
@@ -98,7 +98,7 @@ class FiniteStrain(nn.Module):
         The mean of both stresses acts on the mean of both deformations (Simo and Tarnow 1992), and more by ``damping``
         times the growth of strain (Armero and Romero 2001), which no rotation changes.
         """
-        moduli = self.volume[:, None] * factor * self.lame
+        moduli = lame(self.volume[:, None] * factor)
         return -(strain_pull(first.gradient, second.gradient, moduli, damping).flatten(1) @ self.gradients)
 
     def stiffening(
@@ -151,7 +151,7 @@ class FiniteStrain(nn.Module):
 
     def _stress(self, strain: Float[Tensor, "*S N 3 3"], factor: Float[Tensor, "N 2"]) -> Float[Tensor, "*S N 3 3"]:
         """Hooke's stress of a strain, times volume."""
-        return hooke(strain, self.volume[:, None] * factor)
+        return stress(strain, lame(self.volume[:, None] * factor))
 
 
 def _measures() -> Float[Tensor, "9 63"]:

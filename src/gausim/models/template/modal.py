@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.models.template.finite_strain import hooke
+from gausim.models.template.finite_strain import lame, stress
 
 # Least part of an impulse that damping leaves in its first frame.
 LEAST_LEFT = 0.1
@@ -150,9 +150,8 @@ class ModalScene:
         for correction in range(self.corrections):
             second = law.strain_state(z + (speed + bend) / 2, reference)
             if correction < self.corrections - 1:
-                used = self._inverse(
-                    linear, *((first, second) if correction else 2 * (law.strain_state(z, reference),))
-                )
+                ends = (first, second) if correction else 2 * (law.strain_state(z, reference),)
+                used = self._inverse(linear, *ends)
             bend = bend + _product(used, force + law.between(first, second, factor, damping) - bend @ linear.mT)
         return z + speed + bend
 
@@ -189,9 +188,8 @@ class ModalScene:
             for correction in range(MOST):
                 second = law.strain_state(z + (speed + bend) / 2, reference)
                 if used is None or slow:
-                    used = self._inverse(
-                        linear, *((first, second) if correction else 2 * (law.strain_state(z, reference),))
-                    )
+                    ends = (first, second) if correction else 2 * (law.strain_state(z, reference),)
+                    used = self._inverse(linear, *ends)
                 change = _product(used, force + law.between(first, second, factor, damping) - bend @ linear.mT)
                 bend, size = bend + change, change.norm(dim=-1)
                 if bool((size <= torch.maximum(least, self.solved * (speed + bend).norm(dim=-1))).all()):
@@ -275,4 +273,4 @@ def force_of_strain(
         uneven: stiffness of shear and of volume beyond that of the homogeneous body [1 / frame^2].
         modes: E, strain of the modes near each unit times volume, as ``SolidBody.strains`` gives it.
     """
-    return -hooke(strain.unflatten(-1, (3, 3)), uneven).flatten(1) @ modes.flatten(0, 1)
+    return -stress(strain.unflatten(-1, (3, 3)), lame(uneven)).flatten(1) @ modes.flatten(0, 1)

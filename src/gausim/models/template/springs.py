@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -10,10 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gausim.kernels.operations import operation
-
-# Least square of a spring's length over that at rest.
-LEAST_SQUARE = 1e-6
+from gausim.kernels.operations import LEAST_SQUARE, operation
 
 
 def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
@@ -25,30 +23,31 @@ def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
-class Stretched(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Stretched:
     """Springs in a state."""
 
     change: Float[Tensor, "S E 3"]  # d - d_0 [scene units]
     offset: Float[Tensor, "E 3"]  # d_0 [scene units]
     rest: Float[Tensor, " E"]  # |d_0| [scene units]
 
-    @property
+    @cached_property
     def along(self) -> Float[Tensor, "S E"]:
         """d_0 . (d - d_0)."""
         return (self.offset * self.change).sum(-1)
 
-    @property
+    @cached_property
     def grown(self) -> Float[Tensor, "S E"]:
         """|d|^2 - |d_0|^2."""
         return 2 * self.along + self.change.square().sum(-1)
 
-    @property
+    @cached_property
     def length(self) -> Float[Tensor, "S E"]:
         """|d|."""
         squared = self.rest.square()
         return (squared + self.grown).clamp_min(LEAST_SQUARE * squared).sqrt()
 
-    @property
+    @cached_property
     def stretch(self) -> Float[Tensor, "S E"]:
         """|d| - |d_0|, without the cancellation of a difference."""
         return self.grown / (self.length + self.rest)
