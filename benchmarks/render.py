@@ -17,17 +17,17 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Options, Row, medians, seconds_of
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import Rendered, Renderer
 from gausim.ops.covariance import covariance_from_scales
 from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
-from gausim.render.reference import ReferenceRenderer
 
 # Kernels and edge of the square image [pixels].
 CASES = {False: [(n, size) for n in (5_000, 23_000) for size in (128, 256, 512)], True: [(100, 20), (150, 24)]}
 PAPER = (23_422, 960, 540)  # kernels, width and height of the paper's scene
 VIEWS = 4
-TORCH = "render=reference: plain torch in tiles, one thread"
+TORCH = "plain torch in tiles, one thread"
 SHORT_CALLS = 0.02  # [s]; shorter calls are timed several in a row, as in training
 
 

@@ -160,7 +160,7 @@ def test_the_paper_is_one_word() -> None:
 
 CHOICES = [
     ("model=gausim_paper", ("model", "loss", "optimizer", "plan")), ("data=bunny", ("data",)),
-    ("trainer=ddp", ("trainer",)), ("supervision=tracks", ("supervision",)), ("render=reference", ("render",)),
+    ("trainer=ddp", ("trainer",)), ("supervision=tracks", ("supervision",)), ("render=cpu", ("render",)),
 ]  # fmt: skip
 
 

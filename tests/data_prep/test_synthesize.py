@@ -10,6 +10,7 @@ from helpers.plain import contents
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed (extra 'synth')", allow_module_level=True)
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from data_prep.synthesize import main
 from data_prep.synthetic.bodies import BODIES, Body, bar, jelly
 from data_prep.synthetic.elastic import ElasticBody
@@ -25,7 +26,6 @@ from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.ops.visual_hull import project
 from gausim.render.draw import draw_still
-from gausim.render.reference import ReferenceRenderer
 
 TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
 PUSHED = ("flower", "potted", "pudding")

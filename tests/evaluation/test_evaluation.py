@@ -5,11 +5,11 @@ import pytest
 import torch
 from helpers import toy_object
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.baselines.references import static_motion
 from gausim.core import RunError, Trajectory
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import evaluate_object, results_of, write_evaluation
-from gausim.render.reference import ReferenceRenderer
 from gausim.results.curves import load_curves
 from gausim.results.pivot import Pivot
 from gausim.results.summary import FLOOR

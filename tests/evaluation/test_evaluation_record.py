@@ -10,12 +10,12 @@ import torch
 from helpers import toy_object
 
 import gausim
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.data.objects import ObjectData
 from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
 from gausim.io.video import read_video
 from gausim.metrics.lpips import expected_shapes
 from gausim.pictures.frames import SEEN
-from gausim.render.reference import ReferenceRenderer
 from gausim.runs.provenance import code_provenance
 
 

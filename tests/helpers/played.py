@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import torch
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.compose.build import LoadedRun
 from gausim.core import SimState
 from gausim.data.objects import ObjectData
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.template.material import MaterialTemplate
-from gausim.render.reference import ReferenceRenderer
 from helpers import toy_object
 from helpers.simulators import gausim
 

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import distributed as dist
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.metrics.image import PSNR
-from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks

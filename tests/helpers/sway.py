@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import Frame, GaussianScene, Rendered, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
 from gausim.models.template.material import MaterialTemplate
 from gausim.render.cpu import CpuRenderer
-from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings

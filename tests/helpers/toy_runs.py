@@ -20,7 +20,7 @@ from helpers.simulators import SMALLEST
 # The smallest run in which everything happens that a resumed run could get wrong.
 TINY = (
     *SMALLEST, "model=gausim_paper", "plan.repeats=2", "plan.t_max=3", "plan.t_start=1",
-    "plan.batch_size=1", "render=reference", "trainer.log_every_n_steps=1",
+    "plan.batch_size=1", "render=cpu", "render.threads=1", "trainer.log_every_n_steps=1",
 )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from helpers.chromium import Page, chromium, needs_chromium
 from helpers.plain import unit_motion, unit_scene
 from PIL import Image
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.compose.page import body_page
 from gausim.core import DataError, Trajectory
 from gausim.core.state import SimState, initial_sway
@@ -28,7 +29,6 @@ from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.ops.orbit import orbit_cameras
 from gausim.render.draw import film
-from gausim.render.reference import ReferenceRenderer
 
 SIZE, FRAMES = (480, 420), 100
 PULLS = 1000  # frames

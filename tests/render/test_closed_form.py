@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import Cameras, ConfigError, Rendered, Renderer, Trajectory
 from gausim.ops.rotation import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import SceneAppearance, deformed_appearance, draw, film, to_bytes
-from gausim.render.reference import ReferenceRenderer
 
 FOCAL, SIZE = 30.0, (24, 20)
 BACKGROUND = (0.2, 0.4, 0.6)

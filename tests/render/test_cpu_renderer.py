@@ -6,9 +6,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import ConfigError, DivergenceError
 from gausim.render.cpu import CpuRenderer
-from gausim.render.reference import ReferenceRenderer
 
 CASES = ["usual", "two_bands", "dense", "big", "tiny", "around_the_camera", "off_screen"]
 NAMES = ("means", "covars", "colors", "opacities", "background")

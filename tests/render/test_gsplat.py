@@ -9,13 +9,14 @@ from types import ModuleType
 import pytest
 import torch
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import ConfigError, Rendered
 from gausim.render import auto
 from gausim.render import gsplat as backend
 from gausim.render.auto import AutoRenderer, chosen
 from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
-from gausim.render.reference import NEAR, ReferenceRenderer
+from gausim.render.limits import NEAR
 
 REASON = "gsplat is not installed (pip install 'gausim[gpu]')"
 

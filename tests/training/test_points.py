@@ -10,6 +10,7 @@ from helpers import sway, toy_object
 from torch import Tensor
 
 from benchmarks.harness import peak_saved_bytes
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import GaussianScene, Renderer, SimState, Trajectory
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
@@ -17,7 +18,6 @@ from gausim.losses import ImageLoss, Objective
 from gausim.metrics import point_error
 from gausim.models.hierarchy.batch import Member
 from gausim.render.draw import SceneAppearance, draw
-from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.rollout import States, windows

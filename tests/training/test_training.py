@@ -9,13 +9,13 @@ from helpers import sway
 from lightning.pytorch.callbacks import LambdaCallback
 from torch import Tensor, nn
 
+from benchmarks.reference_renderer import ReferenceRenderer
 from gausim.core import ConfigError, DivergenceError, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.losses import ImageLoss, Objective
 from gausim.models.initial_state import ModalInitialStates
 from gausim.render.draw import draw
-from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.trainer import TrainerSettings, make_trainer

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.render.reference import DILATION, NEAR
+from gausim.render.limits import DILATION, NEAR
 
 VERSION = "1.5.3"  # with the ceiling of alpha that is compiled in
 DEVICE = "cuda"  # the type of the devices that gsplat draws on

@@ -21,7 +21,7 @@ from gausim.render.cpu.projection import (
     project_kernels,
 )
 from gausim.render.cpu.raster import PIXELS, backward_band, forward_band
-from gausim.render.reference import NEAR
+from gausim.render.limits import NEAR
 
 Array = NDArray[Any]
 

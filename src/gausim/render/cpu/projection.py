@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
-from gausim.render.reference import ALPHA_MIN, CLAMP_MARGIN, DILATION
+from gausim.render.limits import ALPHA_MIN, CLAMP_MARGIN, DILATION
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
 # far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, the exponent below which

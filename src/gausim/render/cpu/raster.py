@@ -14,7 +14,7 @@ import numpy as np
 from gausim.kernels.jit import HELPER, KERNEL
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
 from gausim.render.cpu.projection import S_BLUE, S_GREEN, S_RED, S_X, S_XX, S_XY, S_Y, S_YY, S
-from gausim.render.reference import ALPHA_MAX
+from gausim.render.limits import ALPHA_MAX
 
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 PAIR = 2 * TILE_WIDTH  # pixels of two rows, the unit of the entries' row ranges

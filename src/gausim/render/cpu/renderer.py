@@ -88,7 +88,7 @@ class CpuRenderer:
             if value.dtype != torch.float32 or value.device.type != "cpu":
                 raise ConfigError(
                     f"CpuRenderer: expected {name} as float32 on the CPU, got {value.dtype} on {value.device}. "
-                    "Convert it, or use ReferenceRenderer for float64."
+                    "Convert it."
                 )
         behind = torch.from_numpy(np.zeros(3, np.float32)) if background is None else background.to(means)
         inputs["background"] = behind

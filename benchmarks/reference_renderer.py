@@ -5,12 +5,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Rendered
+from gausim.render.limits import ALPHA_MAX, ALPHA_MIN, CLAMP_MARGIN, DILATION, NEAR
 
-NEAR = 0.01  # kernels closer than this to the camera plane are dropped [scene units]
-DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
-ALPHA_MIN = 1.0 / 255.0
-ALPHA_MAX = 0.999  # ceiling of a kernel's opacity at a pixel; compiled into gsplat 1.5.3 (0.99 on its main branch)
-CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by this fraction
 T_STOP = 1e-4  # a kernel that would leave less transmittance than this ends its pixel (3DGS)
 TILE = 16  # [pixels]
 
