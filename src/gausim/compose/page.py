@@ -5,7 +5,6 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
 
 from gausim.compose.build import LoadedRun
 from gausim.compose.live import energy_ceiling
@@ -22,8 +21,6 @@ from gausim.runs.provenance import code_provenance, data_provenance
 
 # Sequences over which the network's share is measured.
 MOST_COMPARED = 3
-# Products that JavaScript computes in a picture of 1/30 s, of one core of a server.
-PRODUCTS = 20e6
 
 
 @torch.no_grad()
@@ -106,26 +103,10 @@ def _model(run: LoadedRun) -> GausSim:
     model = getattr(run.module, "model", None)
     if isinstance(model, GausSim) and isinstance(model.template, MaterialTemplate):
         return model
-    needed = ""
-    if isinstance(model, GausSim):
-        needed = (
-            f" A frame of this run's network takes {network_products(model) / 1e6:.2g} million products, and a page "
-            f"has time for {PRODUCTS / 1e6:.0f} million at 30 frames per second."
-        )
     raise ConfigError(
-        f"{run.run_dir}: --format page needs a run of model=gausim, whose template is a few matrices.{needed} Export "
-        "this one with --format html, which plays its predictions."
+        f"{run.run_dir}: --format page needs a run of model=gausim, whose template is a few matrices. Export this "
+        "one with --format html, which plays its predictions."
     )
-
-
-@torch.no_grad()
-def network_products(model: GausSim) -> float:
-    """Products of matrices in a step of the first scene."""
-    scene = model.scenes[0]
-    stepper = SceneDynamics(model, 0).stepper(SimState(scene.means, scene.means))
-    with FlopCounterMode(display=False) as counter:
-        stepper.step(None)
-    return counter.get_total_flops() / 2
 
 
 def _refuse(scene: GaussianScene, item: RunObject) -> None:
