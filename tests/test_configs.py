@@ -147,7 +147,7 @@ def test_the_paper_is_one_word() -> None:
     assert simulator.template is None and simulator.head.lever == 0 and simulator.rollout.energy_guard_frames == 0
     assert config.model.initial_states._target_.endswith(".FreeInitialStates")
     loss = config.loss
-    assert (loss.image.balance, loss.backprop_steps, loss.rest_image_weight, loss.energy.probability) == (0.9, 1, 1, 0)
+    assert (loss.image.balance, loss.backprop_steps, loss.rest_image_weight) == (0.9, 1, 1)
     rates = {config.optimizer[name] for name in ("network_lr", "scene_lr", "initial_lr")}
     assert rates == {4 * 2e-4} and config.plan.batch_size == 4  # one sequence on each of four GPUs
     assert config.optimizer.optimizer._target_ == "torch.optim.Adam"

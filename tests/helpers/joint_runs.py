@@ -13,7 +13,7 @@ from helpers.simulators import SMALLEST
 
 TINY = (
     *SMALLEST, "plan.t_start=2", "plan.t_max=2", "plan.repeats=1", "plan.epochs=2",
-    "trainer.accelerator=cpu", "render=cpu", "logger=none", "loss.energy.probability=0",
+    "trainer.accelerator=cpu", "render=cpu", "logger=none",
 )  # fmt: skip
 # One of the paper's model, without pictures and dashboards.
 PAPER = (

@@ -11,15 +11,13 @@ from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 
 from gausim.kernels.operations import plain_forms
-from gausim.losses.objective import EnergyLoss, Objective
+from gausim.losses.objective import Objective
 from gausim.models.template.material import MaterialTemplate
 from gausim.models.template.template import RestTemplate
 from gausim.training.graphed import GraphedRollouts, _Stretch
 from gausim.training.module import GausSimModule
 
-# Every batch has free motion, where a template knows its energy.
-ENERGY = EnergyLoss(weight=None, probability=1.0, frames=6, stretch=2)
-OBJECTIVE = Objective(static_weight=0.0, backprop_steps=0, energy=ENERGY)
+OBJECTIVE = Objective(static_weight=0.0, backprop_steps=0)
 MATERIAL = partial(MaterialTemplate, modes=6)
 TEMPLATES = pytest.mark.parametrize("template", [RestTemplate, ELASTIC, MATERIAL])
 
@@ -59,7 +57,7 @@ def test_a_rollout_from_tensors_to_tensors_has_the_same_gradients(monkeypatch: p
     monkeypatch.setattr(torch.cuda, "make_graphed_callables", captured)
     monkeypatch.setattr(GraphedRollouts, "serves", True)
     found, own = optimised(module_on("cpu", template=ELASTIC), 3)
-    assert captures == [2, 2]  # once for three updates, and once for their free motion
+    assert captures == [2]  # once for three updates
     assert found == expected
     for name, gradient in own.items():  # what is not used has zeros instead of none
         assert torch.equal(gradient, gradients.get(name, torch.zeros_like(gradient)))

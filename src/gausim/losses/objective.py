@@ -10,31 +10,6 @@ from gausim.losses.image import ImageLoss
 
 
 @dataclass(frozen=True)
-class EnergyLoss:
-    """Loss on energy that free motion gains beyond the training frames.
-
-    Attributes:
-        weight: weight of the relative growth, times the batch's image loss; 0 is off. It needs a template with an
-            energy; None is 1 with one, else 0.
-        frames: number of frames of that motion.
-        stretch: frames over which its energy is averaged, about a period; loss gradients stop at its ends.
-        probability: probability of this term in a batch.
-    """
-
-    weight: float | None = None
-    frames: int = 36
-    stretch: int = 12
-    probability: float = 0.2
-
-    def __post_init__(self) -> None:
-        if (self.weight or 0) < 0 or not 0 <= self.probability <= 1 or not 0 < self.stretch < self.frames:
-            raise ConfigError(
-                "loss.energy: expected weight >= 0 or null, 0 <= probability <= 1 and 0 < stretch < frames, got "
-                f"{self.weight}, {self.probability}, {self.stretch} and {self.frames}."
-            )
-
-
-@dataclass(frozen=True)
 class Objective:
     """Objective of an optimiser step (METHOD section 4).
 
@@ -46,7 +21,6 @@ class Objective:
         static_probability: probability of the static loss in a batch; None is 1 / T.
         momentum_weight: weight of the momentum loss [(total mass x diagonals)^2], times the rest state's loss.
         backprop_steps: loss gradients stop after this number of steps; 0 lets them through the whole rollout.
-        energy: the loss on energy gained by free motion.
         explosion: distance from rest of a kernel [diagonals of the scene's bounding box] at which a rollout ends, with
             no loss beyond it; the log counts these rollouts.
     """
@@ -57,7 +31,6 @@ class Objective:
     static_probability: float | None = None
     momentum_weight: float = 1.5e4
     backprop_steps: int = 0
-    energy: EnergyLoss = field(default_factory=EnergyLoss)
     explosion: float = 3.0
 
     def __post_init__(self) -> None:

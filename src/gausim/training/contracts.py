@@ -25,7 +25,7 @@ class Simulator(Protocol):
     """Dynamics of a batch of sequences, as a torch module.
 
     Training uses these members of :class:`gausim.models.step.scene_model.SceneModel` where a model has them: the units
-    of its kernels (``units_of_kernels``) and an energy (``knows_energy``, ``energy``).
+    of its kernels (``units_of_kernels``).
     """
 
     scenes: Sequence[GaussianScene]  # the rest scenes; their index is the ``scene_id`` of samples
@@ -36,7 +36,7 @@ class Simulator(Protocol):
     def prepare(self, batch: Any, **options: Any) -> Any:
         """Quantities common to the steps of one stretch; part of its graph, so each stretch computes its own.
 
-        ``options`` is ``isolated=True`` where a step leaves out the surroundings of a simulator that knows any.
+        ``options`` is ``isolated=True`` where a step from rest leaves out the surroundings.
         """
 
     def step(

@@ -20,21 +20,21 @@ Replay = Callable[..., tuple[Tensor, ...]]
 class _Stretch(nn.Module):
     """T steps of a batch, from tensors to tensors."""
 
-    def __init__(self, model: nn.Module, batch: SceneBatch, steps: int, *, isolated: bool = False) -> None:
+    def __init__(self, model: nn.Module, batch: SceneBatch, steps: int) -> None:
         super().__init__()
-        self.model, self._batch, self._steps, self._isolated = model, batch, steps, isolated
+        self.model, self._batch, self._steps = model, batch, steps
 
     def forward(self, positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
         """Positions, deformation gradients, rotations and momentum losses of the T frames."""
         model, state = cast(Any, self.model), SimState(positions, previous)
-        ((_, made),) = windows(model, self._batch, state, self._steps, self._steps, isolated=self._isolated)
+        ((_, made),) = windows(model, self._batch, state, self._steps, self._steps)
         return (*States.of(made), torch.stack([step.momentum for step in made]))
 
 
 class GraphedRollouts:
     """Rollouts of one simulator, captured with their backward pass at the first call and replayed at later ones.
 
-    A capture holds for one number of sequences and steps, with or without surroundings, and one choice of trained
+    A capture holds for one number of sequences, of steps and one choice of trained
     parameters; the last one of each number of sequences is kept. Parameters and input statistics are read and written
     at their addresses: they may change in place only. Each rollout is followed by at most one backward pass, before the
     next rollout of its kind.
@@ -55,7 +55,7 @@ class GraphedRollouts:
         )  # fmt: skip
 
     def windows(
-        self, batch: SceneBatch, initial: SimState, steps: int, length: int, *, isolated: bool = False
+        self, batch: SceneBatch, initial: SimState, steps: int, length: int
     ) -> Iterator[tuple[int, list[Frame]]]:
         """As :func:`gausim.training.rollout.windows`, by replays where they serve.
 
@@ -63,21 +63,21 @@ class GraphedRollouts:
             ConfigError: the rollout cannot be captured, because one of its operations waits for the device.
         """
         if not self.serves or steps % length:
-            yield from windows(cast(Any, self._model), batch, initial, steps, length, isolated=isolated)
+            yield from windows(cast(Any, self._model), batch, initial, steps, length)
             return
         state = initial
         for start in range(0, steps, length):
             state = state.detach() if start else state
-            made = self._replayed(batch, state, length, isolated)
+            made = self._replayed(batch, state, length)
             state = after(made, state)
             yield start, made
 
-    def _replayed(self, batch: SceneBatch, initial: SimState, steps: int, isolated: bool) -> list[Frame]:
+    def _replayed(self, batch: SceneBatch, initial: SimState, steps: int) -> list[Frame]:
         given, parameters = (initial.positions, initial.previous), list(self._model.parameters())
-        kind, trained = (len(batch.members), isolated), tuple(x.requires_grad for x in (*given, *parameters))
+        kind, trained = len(batch.members), tuple(x.requires_grad for x in (*given, *parameters))
         if self._kept.get(kind, ((), None))[0] != (steps, trained):
             self._kept.pop(kind, None)  # frees its memory before the next one takes as much
-            stretch = _Stretch(self._model, batch, steps, isolated=isolated)
+            stretch = _Stretch(self._model, batch, steps)
             self._kept[kind] = (steps, trained), self._capture(stretch, initial)
         for parameter in parameters:  # or autograd would adopt the buffer of the capture, which is overwritten
             if parameter.requires_grad and parameter.grad is None:

@@ -7,13 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, Hands, Renderer, SimState, Trajectory
+from gausim.core import ConfigError, Hands, Renderer, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
-from gausim.models.reference.reference import hand_motion
 from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
-from gausim.training.contracts import SceneBatch, Simulator
+from gausim.training.contracts import Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.graphed import GraphedRollouts
 from gausim.training.method import SharedSimulator
@@ -22,7 +21,6 @@ from gausim.training.ranks.ranks import Ranks
 from gausim.training.rollout import States, windows
 from gausim.training.statistics import Baselines, SequenceBaseline
 from gausim.training.supervision.images import ImageSupervision, Supervision
-from gausim.training.terms.free_motion import FreeMotion
 
 
 class Learner(nn.Module):
@@ -49,7 +47,6 @@ class Learner(nn.Module):
         self.objective = objective or Objective()
         self.settings = optimizer or OptimizerSettings()
         self.graphs = GraphedRollouts(method.model)
-        self.free_motion = FreeMotion(method.model, self.objective, self.graphs)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.images.begins = self._begins
@@ -109,15 +106,6 @@ class Learner(nn.Module):
         """Poses of the hands of each sample's sequence; None where no sample has any."""
         found = [self.method.hands(sample.sequence_id) for sample in samples]
         return found if any(own is not None for own in found) else None
-
-    @torch.no_grad()
-    def isolated(
-        self, batch: SceneBatch, state: SimState, hands: Sequence[Hands | None] | None, frame: int
-    ) -> SimState:
-        """A state relative to the bodies' references, as a step without surroundings takes it."""
-        motions = None if hands is None else [hand_motion(own, frame) for own in hands]
-        moved: SimState = self.simulator.prepare(batch).reference.isolated(state, motions)
-        return moved
 
     @torch.no_grad()
     def predict(self, sequence_id: int, steps: int) -> Trajectory:

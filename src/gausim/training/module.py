@@ -38,7 +38,7 @@ class GausSimModule(OptimiserStep, LightningModule):
 
         Args:
             plan: the resolved plan; constant rates when None.
-            seed: seed of each step's random numbers (static loss, free motion), together with the step's number.
+            seed: seed of each step's random numbers (static loss), together with the step's number.
             parts: arguments of the learner.
         """
         super().__init__(**parts)

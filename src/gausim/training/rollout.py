@@ -34,13 +34,12 @@ def windows(
     length: int,
     *,
     hands: Sequence[Hands | None] | None = None,
-    isolated: bool = False,
 ) -> Iterator[tuple[int, list[Frame]]]:
     """Predicts ``steps`` frames of a batch in stretches of ``length`` frames.
 
     Loss gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from
     detached values, so a backward pass after every stretch needs memory for one stretch only. ``hands`` are those of
-    every member; ``isolated`` leaves out the surroundings (:meth:`gausim.models.step.simulator.GausSim.prepare`).
+    every member.
 
     Yields:
         The number of frames predicted before the stretch, and its steps.
@@ -49,7 +48,7 @@ def windows(
     for start in range(0, steps, length):
         state = state.detach() if start else state
         made: list[Frame] = []
-        prepared = model.prepare(batch, **({"isolated": True} if isolated else {}))
+        prepared = model.prepare(batch)
         for number in range(start, start + min(length, steps - start)):
             moved: dict[str, Any] = {}
             if hands is not None:

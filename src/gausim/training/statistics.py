@@ -85,7 +85,6 @@ class Measured:
     momentum: list[float]  # momentum loss of each frame, summed over sequences
     motion: float  # squared change of the predicted images, summed over frames and sequences
     static: float | None  # the static loss of this rank's scenes, if the batch had this term
-    growth: float | None  # energy growth of free motion, this rank's part of the mean, if measured
     gradients: dict[str, float]  # norm of each parameter group's loss gradient; equal on all ranks
 
     @staticmethod
@@ -96,11 +95,9 @@ class Measured:
         held = [part for part in parts if part.images]  # the others had no sequence
         images = [interleave(rows) for rows in zip(*(part.images for part in held), strict=True)]
         momentum = [sum(values) for values in zip(*(part.momentum for part in held), strict=True)]
-        static, growth = (
-            sum(known) if (known := [v for part in parts if (v := getattr(part, name)) is not None]) else None
-            for name in ("static", "growth")
-        )
-        return Measured(images, momentum, sum(part.motion for part in held), static, growth, parts[0].gradients)
+        static = [part.static for part in parts if part.static is not None]
+        motion = sum(part.motion for part in held)
+        return Measured(images, momentum, motion, sum(static) if static else None, parts[0].gradients)
 
     def check(self, samples: Sequence[SampleFacts]) -> None:
         """Raises DivergenceError where a value is not finite; names the step and the sequence, if it has one."""
@@ -117,9 +114,9 @@ class Measured:
     def stats(self, steps: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
         """Logged metrics of a step of T = ``steps`` predicted frames, from the baselines of its sequences."""
         frames, count = self.images, len(baselines)
-        single = {"loss_static": self.static, "energy_growth": self.growth}
         stats = {f"grad_{name}": value for name, value in self.gradients.items()}
-        stats.update({name: value for name, value in single.items() if value is not None})
+        if self.static is not None:
+            stats["loss_static"] = self.static
         stats.update(steps=float(steps), exploded=float(len(frames) < steps))
         if frames:
             stats["loss_momentum"] = sum(self.momentum) / (steps * count)
@@ -136,17 +133,14 @@ class Statistics:
     momentum: list[Float[Tensor, " T"]] = field(default_factory=list)
     motion: list[Float[Tensor, ""]] = field(default_factory=list)
     static: Float[Tensor, ""] | None = None
-    growth: Float[Tensor, ""] | None = None
 
     def fetch(self, norms: Mapping[str, Tensor]) -> Measured:
         """Copies the figures and the norms of the parameter groups' loss gradients to the host."""
-        static, growth = (None if value is None else float(value) for value in (self.static, self.growth))
         return Measured(
             [row for table in self.images for row in table.tolist()],
             [value for values in self.momentum for value in values.tolist()],
             sum(float(value) for value in self.motion),
-            static,
-            growth,
+            None if self.static is None else float(self.static),
             {name: float(norm) for name, norm in norms.items()},
         )
 

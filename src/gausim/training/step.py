@@ -12,7 +12,7 @@ from gausim.losses.objective import static_loss
 from gausim.training.contracts import SceneBatch
 from gausim.training.learner import Learner
 from gausim.training.ranks.ranks import interleave
-from gausim.training.rollout import States, after, check_reach, describe, reach, windows
+from gausim.training.rollout import States, check_reach, describe, reach, windows
 from gausim.training.statistics import Measured, Statistics
 
 # Successive batches whose rollouts explode in the first stretch, after which training counts as diverged.
@@ -66,13 +66,12 @@ class OptimiserStep(Learner):
         if any(s.steps != steps for s in whole):
             raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
         length, weight = objective.window(steps), 1 / (steps * len(whole))
-        free, unit = self.free_motion.chosen(draws), self._momentum_unit(samples)
+        unit = self._momentum_unit(samples)
         if not samples:  # takes part in the ranks' decision on where the rollout ends
             any(self._explodes(None, None, start, whole) for start in range(0, steps, length))
             return statistics
         batch, hands = self.simulator.batch([s.scene_id for s in samples]), self.hands(samples)
         comparison, initial = self.supervision.comparison(samples, batch), self.method.initial(samples, batch)
-        own, last = torch.zeros(len(samples), device=batch.rest.device), initial
         for start, made in (
             self.graphs.windows(batch, initial, steps, length)
             if hands is None and length == steps
@@ -90,11 +89,6 @@ class OptimiserStep(Learner):
             statistics.images.append(losses.detach())
             statistics.momentum.append(momentum.detach())
             statistics.motion.append(motion)
-            own = own + weight * losses.detach().sum(0)
-            last = after(made, last)
-        if free is not None:
-            state = self.isolated(batch, last, hands, steps)
-            statistics.growth = self.free_motion.descend(batch, state, own, len(whole), free, self.accumulate)
         return statistics
 
     def _explodes(

@@ -64,14 +64,6 @@ class FreeBody(Body):
         affine = about(positions, centre).mT @ self.weighted @ self.inverse
         return centre, polar_rotation(affine)
 
-    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
-        """The kernels in the axes of the body."""
-        (centre, rotation), (last_centre, last) = self.pose(state.positions), self.pose(state.previous)
-        now = self.centre + about(state.positions, centre) @ rotation
-        before = self.centre + about(state.previous, last_centre) @ last
-        still = ~self.simulated[:, None]
-        return SimState(torch.where(still, self.kernels, now), torch.where(still, self.kernels, before))
-
     def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
         """Rotation of the best fit of the rest shape."""
         return self.pose(state.positions)[1]

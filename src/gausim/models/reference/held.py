@@ -136,19 +136,6 @@ class HeldBody(Body):
         offset = self.units - self.shape.rest.to(self.units)
         return place + apply(gradient, offset), axes, gradient, turns
 
-    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
-        """The kernels relative to the static shape."""
-        hands = hands or HandMotion(None, None, None)
-        return SimState(self._relative(state.positions, hands.now), self._relative(state.previous, hands.before))
-
-    def _relative(self, positions: Tensor, pose: HandPose | None) -> Tensor:
-        place, axes, gradient, _ = self.at(pose)
-        unit = self.unit_of_kernel.clamp_max(len(self.units) - 1)
-        static = place[unit] + apply(gradient[unit], self.kernels - self.units[unit])
-        moved = self.kernels + (positions - static) @ axes
-        still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
-        return torch.where(still[:, None], self.kernels, moved)
-
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> "HeldMotion":
         """The units relative to the static shape, and the load of its acceleration, gravity and slope in its axes."""
         return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))

@@ -67,10 +67,6 @@ class Body:
         """A step of the body from its units (N, 3) and kernels at t and t - 1."""
         return Carried(UnitMotion(self.units, now, before, now.new_zeros(len(now), 12)))
 
-    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
-        """A state relative to the reference."""
-        return state
-
     def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
         """Rotation of the undeformed body in a state."""
         return torch.eye(3).to(state.positions)
@@ -107,10 +103,6 @@ class Reference:
         """Rotation of the undeformed body of every finest unit in a state of the kernels; None where nothing moves."""
         return None
 
-    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
-        """A state of the kernels relative to the reference."""
-        return state
-
 
 class MovingReference(Reference):
     """The references of a batch, member by member."""
@@ -137,13 +129,6 @@ class MovingReference(Reference):
         """Rotation of the undeformed body of every finest unit in a state of the kernels."""
         members = zip(self._bodies, self._own(state), self._spans, strict=True)
         return torch.cat([body.turned(own).expand(span.stop - span.start, 3, 3) for body, own, span in members])
-
-    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
-        """A state of the kernels relative to the references."""
-        hands = hands or [None] * len(self._bodies)
-        members = zip(self._bodies, self._own(state), hands, strict=True)
-        parts = [body.isolated(own, held) for body, own, held in members]
-        return SimState(torch.cat([p.positions for p in parts]), torch.cat([p.previous for p in parts]))
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
         """The finest units' positions relative to the references, and the way back."""

@@ -24,7 +24,7 @@ class EpochSummary(Callback):
 
     COLUMNS = (
         "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "ratio_first",
-        "motion_energy", "loss_momentum", "loss_static", "energy_growth", "grad_network",
+        "motion_energy", "loss_momentum", "loss_static", "grad_network",
         "grad_scene", "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
     )  # fmt: skip
