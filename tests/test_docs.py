@@ -168,7 +168,7 @@ STANDS_FOR = {
     "MINE": "data/pudding_soft", "MINE/scene.ply": "data/pudding_soft/scene.ply", "NEW": "data/pudding_soft",
     "RUN": RUN, "RUN2": RUN, "SCENE.ply": "data/pudding_soft/scene.ply", "data=MINE": "data=data/pudding_soft",
     "seed=0,1,2": "seed=0", "push.json": f"{RUN}/simulation/pudding_soft/forces/session.json",
-    "outputs/demo/seed_0": RUN, "outputs/pretrain/seed_0": RUN, "DIR…": RUN,
+    "outputs/demo/seed_0": RUN, "DIR…": RUN,
 }  # fmt: skip
 SMALL = {
     "train": ["plan.epochs=1", "plan.repeats=1", "plan.t_max=3", "plan.warm_start.updates=3", "trainer.panel_epochs=0"],

@@ -25,8 +25,7 @@ CALLS = {
     "prepare select": ["{}", "--pinned", "below z=0.1", "--out", "out"],
     "prepare assemble": ["{}", "--out", "out"], "prepare pack": ["{}", "--out", "out"],
     "prepare public": ["physdreamer", "{}", "--out", "out", "--cameras", "p0"],
-    "prepare corpus": ["--meshes", "{}", "--out", "out"], "prepare blender_bunny": ["--mesh", "{}", "--out", "out",
-                                                                              "--blender-python", sys.executable],
+    "prepare blender_bunny": ["--mesh", "{}", "--out", "out", "--blender-python", sys.executable],
     "prepare poses --colmap": ["--colmap", "{}", "--images", "empty", "--out", "out"],
     "prepare poses --transforms": ["--transforms", "{}", "--out", "out"],
 }  # fmt: skip

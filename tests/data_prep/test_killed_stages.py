@@ -18,7 +18,7 @@ CAPTURE = runpy.run_path(str(Path(__file__).with_name("test_assemble.py")))["Cap
 ROOM = runpy.run_path(str(Path(__file__).with_name("test_poses.py")))
 Run = Callable[..., dict[str, Any]]
 STAGES = ("ingest", "poses", "segment", "select", "assemble", "pack", "public", "poses-mapping",
-          "synthesize", "corpus")  # fmt: skip
+          "synthesize")  # fmt: skip
 SHARES = (0.0, 0.5, 1.0)
 
 
@@ -54,7 +54,6 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         ],
         "synthesize": "--quick --objects pudding_soft --sequences 1 --frames 16 --resolution 24 --kernels 60 "
         "--workers 1".split(),
-        "corpus": "--bodies 2 --sequences 1 --frames 4 --kernels 60 60 --workers 1".split(),
     }  # fmt: skip
 
     class Made(dict):

@@ -9,18 +9,16 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from gausim.cli.output import end, named_bar
-from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
+from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.data_paths import data_option
 from gausim.compose.predict import run_objects, state_of
 from gausim.core.errors import ConfigError, DataError
 from gausim.data.objects import ObjectData
-from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.pictures.figures import error_figure
 from gausim.report.verdict import first_sentences
 from gausim.results.curves import ObjectCurves
 from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
-from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
 from gausim.runs.provenance import code_provenance
 
@@ -29,8 +27,6 @@ WRITTEN = ("metrics.json", "metrics.npz", "table.md")
 
 def evaluate(arguments: argparse.Namespace) -> int:
     """Measures a run by the options of the command; returns the exit status."""
-    if is_pretrained(arguments.run):
-        return _evaluate_bodies(arguments)
     run = load_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
     facts = {**{key: run.config.get(key) for key in ("name", "seed")}, "views": arguments.cameras, **state_of(run)}
     part, sequences = _choose(run, arguments)
@@ -60,37 +56,6 @@ def evaluate(arguments: argparse.Namespace) -> int:
     following = [[command, arguments.run] for command in commands]
     end(first_sentences(written), "tables", folder / "table.md", *following)
     return 0
-
-
-def _evaluate_bodies(arguments: argparse.Namespace) -> int:
-    """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
-    parts = arguments.objects or arguments.sequences or arguments.cameras != "all" or arguments.test
-    if parts:
-        raise ConfigError(
-            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --objects, "
-            "--sequences, --cameras and --test."
-        )
-    folder = arguments.out or arguments.run / "evaluation"
-    module, data = load_corpus_run(arguments.run, data=data_option(arguments.data), device=arguments.device)
-    pretrained = _pretrained(arguments.run, data.trainable)
-    whole = write_figures(folder, body_figures(module, data), seen=data.seen, pretrained=pretrained)
-    if arguments.json:
-        print((folder / FILE).read_text(), end="")
-        return 0
-    end(sentences(whole), "figures", folder / FILE)
-    return 0
-
-
-def _pretrained(run: Path, trainable: int) -> int | None:
-    """Number of bodies that the network of a run on a corpus was trained on; None where its base is gone."""
-    config = RunDirectory(run).config()
-    if config["data"]["part"] != "train":
-        base = config.get("init_from")
-        if base is None or not Path(base).is_dir():
-            return 0 if base is None else None
-        config = RunDirectory(base).config()
-    bodies = config["data"].get("bodies")
-    return trainable if bodies is None else int(bodies)
 
 
 def _evaluate(

@@ -19,7 +19,6 @@ STAGES = {
     "assemble": "assemble stills, sequences and scene of one object into a data set",
     "pack": "pack a data set's sequences for streaming",
     "public": "bring a public set to our layout: READY, Spring-Gaus, PhysDreamer",
-    "corpus": "make random elastic bodies with known motion and material, to pretrain on",
     "synthesize": "make the embedded synthetic set: puddings and flowers that MuJoCo moves",
     "blender_bunny": "make the paper's synthetic set: any mesh as a soft body of Blender",
     "lpips": "fetch the LPIPS weights, so that evaluations measure LPIPS",

@@ -18,7 +18,6 @@ from gausim.compose.targets import check_seed
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
-from gausim.data.pretraining import CorpusDataModule
 from gausim.losses.objective import Objective
 from gausim.render.auto import AutoRenderer
 from gausim.render.cpu import CpuRenderer
@@ -30,12 +29,9 @@ from gausim.runs.names import TEST
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.plan import DataFacts, TrainingPlan
-from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources
 
 logger = logging.getLogger(__name__)
-
-CORPUS = "gausim.data.pretraining.CorpusDataModule"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +120,8 @@ def _simulator(config: DictConfig, datamodule: ReadyDataModule) -> GausSimModule
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in datamodule.objects])()
     entries, node = datamodule.index.entries, config.get("supervision")
     scene_of_sequence = [scene_id for scene_id, _ in entries]
-    if isinstance(datamodule, CorpusDataModule):
-        method: SharedSimulator = KnownStates(model, datamodule, scene_of_sequence)
-    else:
-        states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
-        method = SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
+    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+    method = SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
     truth, references = datamodule.index.ground_truth, method.references
     sources = Sources(scenes, truth, model.smooth_motions, renderer, objective.image, references)
     return GausSimModule(
@@ -144,7 +137,7 @@ def _simulator(config: DictConfig, datamodule: ReadyDataModule) -> GausSimModule
 
 def _resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingPlan:
     plan: TrainingPlan = instantiate(config.plan)
-    trainer, count = config.trainer, datamodule.trained()[0]
+    trainer, count = config.trainer, len(datamodule.index)
     ranks = int(trainer.get("devices", 1)) * int(trainer.get("num_nodes", 1))
     frames = min(len(item.train_frames) for item in datamodule.objects)
     if "method" not in config.model:
@@ -158,8 +151,6 @@ def _resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingP
 
 
 def _can_warm_start(config: DictConfig, datamodule: ReadyDataModule) -> bool:
-    if not datamodule.has_videos:
-        return False
     bodies = [item.surroundings for item in datamodule.objects]
     if any(body.free or body.floor is not None for body in bodies):
         return False
@@ -174,37 +165,17 @@ def load_run(run_dir: Path | str, *, data: Mapping[str, Any] | None = None, devi
     :func:`gausim.compose.device.find_device`.
 
     Raises:
-        ConfigError: there is no such device, or the run was pretrained on bodies without videos.
+        ConfigError: there is no such device.
         RunError: the run or checkpoint is missing, or the scene differs from the one it was trained on.
         DataError: the data set or scene of the configuration is not on this machine, and no replacement is given.
     """
     directory, place = RunDirectory(run_dir), find_device(device)
-    if is_pretrained(directory.path):
-        raise ConfigError(
-            f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
-            f"it: `gausim train data=OBJECT init_from={directory.path}`."
-        )
     config, module, datamodule = _load(directory, data)
     # A renderer of the other kind of device gives way to the one that fits.
     renderer: Renderer = module.renderer
     if isinstance(renderer, CpuRenderer if place.type == "cuda" else GsplatRenderer):
         renderer = cast(Renderer, AutoRenderer())
     return LoadedRun(config, module.to(place), datamodule.objects, datamodule, renderer, directory.path, place)
-
-
-def is_pretrained(run_dir: Path | str) -> bool:
-    """Whether a run was trained on, or fitted to, bodies of a corpus."""
-    target = RunDirectory(run_dir).config().get("data", {}).get("_target_")
-    return bool(target == CORPUS)
-
-
-def load_corpus_run(
-    run_dir: Path | str, *, data: Mapping[str, Any] | None = None, device: str = "cpu"
-) -> tuple[GausSimModule, CorpusDataModule]:
-    """Loads a run of which :func:`is_pretrained` is true; arguments and errors are those of :func:`load_run`."""
-    place = find_device(device)
-    _, module, datamodule = _load(RunDirectory(run_dir), data)
-    return cast(GausSimModule, module.to(place)), cast(CorpusDataModule, datamodule)
 
 
 def _load(
@@ -215,7 +186,7 @@ def _load(
     loaded = read_checkpoint(directory.checkpoint)
     config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
-    if datamodule.has_videos and (changed := changed_files(directory.path, datamodule.objects)):
+    if changed := changed_files(directory.path, datamodule.objects):
         logger.warning("%s What follows is of the data as they are now.", changed)
     check_scenes(loaded, module.scenes, str(directory.checkpoint))
     load_weights(module, loaded)

@@ -52,7 +52,7 @@ def train(opened: Opened, run: RunDirectory, *, notes: Mapping[str, Any] | None 
             resume = run.checkpoint_to_resume
         seed_everything(cfg.seed, workers=True, verbose=False)
         check_protocol(cfg, data)
-        if data.has_videos and (first or Ranks().size > 1):
+        if first or Ranks().size > 1:
             Ranks().first(lambda: _note_data(run, data, resumed=resume is not None))
         if "joint" in str(cfg.ablation.name).split("+") and len(data.objects) == 1:
             raise ConfigError(f"ablation=joint: expected several objects, the data have {data.objects[0].name} alone.")
@@ -101,7 +101,7 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 def check_protocol(cfg: DictConfig, data: ReadyDataModule) -> None:
     """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
     part, trials = cfg.data.get("part"), cfg.trials
-    if not cfg.evaluate or not data.has_videos:
+    if not cfg.evaluate:
         return
     names = [(item.test_part, record.name) for item in data.objects for record in item.sequences]
     reserved = [name in part_of for part_of, name in names]

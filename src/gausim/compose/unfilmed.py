@@ -17,14 +17,15 @@ from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import scene_dynamics
 from gausim.models.step.simulator import GausSim
-from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.material import REFERENCE_FPS, MaterialTemplate
 from gausim.ops.selection import require_pinned
 from gausim.runs.directory import RunDirectory
-from gausim.training.pretraining import give_even_material
 from gausim.training.transfer import load_shared
 
 # The model without a trained run: its untrained network outputs zero, so that only the template acts.
 UNTRAINED = "gausim"
+# Corrections of the stiffness, to which the decoders add a little that depends on it.
+ROUNDS = 6
 
 
 def open_scene(
@@ -64,7 +65,7 @@ def open_scene(
     else:
         model = _of_base(scene, fps, base)
     if base is not None or stiffness is not None or damping is not None:
-        give_even_material(model, 0, period=(stiffness or 1.0) ** -0.5, damping=damping or 0.5)
+        _give_material(model, period=(stiffness or 1.0) ** -0.5, damping=damping or 0.5)
     place, swaying = find_device(device), initial_sway(scene, sway)
     initial = SimState(swaying.positions.to(place), swaying.previous.to(place))
     model = model.to(place)
@@ -86,7 +87,7 @@ def _of_base(scene: GaussianScene, fps: float, base: Path) -> GausSim:
     if model is None or not isinstance(model.template, MaterialTemplate):
         raise ConfigError(
             f"--from {base}: expected a run of the neural simulator (model=gausim), whose attributes are stiffness and "
-            "damping. Pretrain one: `gausim train experiment=pretrain data.root=CORPUS`."
+            "damping."
         )
     load_shared(model, base, config)
     model.freeze(scenes=True)
@@ -95,3 +96,20 @@ def _of_base(scene: GaussianScene, fps: float, base: Path) -> GausSim:
 
 def _built(node: Any, scene: GaussianScene, fps: float) -> GausSim:
     return cast("GausSim", instantiate(node, scenes=[scene], fps=[fps])())
+
+
+@torch.no_grad()
+def _give_material(model: GausSim, *, period: float, damping: float) -> None:
+    """Gives the only scene a material that is the same everywhere.
+
+    Attribute 0 is the logarithm of the stiffness over that of the template's reference material. That ratio follows
+    from the ``period`` of the slowest mode [s], since the matrices of the template are known. Attribute 1 is the
+    logarithm of the ``damping`` [1 / s] over the reference's.
+    """
+    template, batch = cast("MaterialTemplate", model.template), model.batch((0,))
+    attributes = model.attributes[0].zero_()
+    attributes[:, 1] = math.log(damping / (REFERENCE_FPS * math.exp(template.log_drag)))
+    for _ in range(ROUNDS):
+        unit = model.units(batch)[-1][-1]
+        made = template.slowest_period(0, unit.log_density, unit.attributes)
+        attributes[:, 0] += 2 * math.log(made / period)

@@ -23,11 +23,8 @@ class ReadyDataModule(LightningDataModule):
 
     Attributes:
         plan: shows, batch size and predicted frames; set before training batches are asked for.
-        has_videos: whether its objects were filmed.
         sealed: whether unseen frames and the true motion of the test part are refused; set before objects are read.
     """
-
-    has_videos = True
 
     def __init__(
         self,
@@ -102,19 +99,9 @@ class ReadyDataModule(LightningDataModule):
             if self.plan is None:
                 raise ConfigError("data: expected a resolved training plan (gausim.training.plan), got none.")
             rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-            count, frames = self.trained()
             self._sampler = SequenceBatchSampler(
-                count, plan=self.plan, seed=self._seed, rank=rank, world_size=ranks, frames=frames
+                len(self.index), plan=self.plan, seed=self._seed, rank=rank, world_size=ranks
             )
-
-    def trained(self) -> tuple[int, list[int] | None]:
-        """The number of sequences to train on and, where samples start at any frame, their numbers of frames."""
-        return len(self.index), None
-
-    @property
-    def watched(self) -> range:
-        """Indices of the objects whose motion is measured during training."""
-        return range(len(self.objects))
 
     def introduction(self) -> list[str]:
         """A line per object, and one about what of it is not trained on."""

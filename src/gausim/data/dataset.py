@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import UInt8
@@ -18,8 +18,7 @@ class SampleKey(NamedTuple):
     """Key by which the batch sampler requests a training sample."""
 
     sequence: int  # global sequence id
-    steps: int  # predicted steps T; the sample has frames start..start + T
-    start: int = 0  # first frame
+    steps: int  # predicted steps T; the sample has frames 0..T
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,6 @@ class SampleFacts:
     sequence_id: int  # running index of the sequence over all objects
     sequence_name: str  # its name within the object
     steps: int  # predicted steps T
-    start: int = 0  # number of its first frame in its sequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,6 @@ class SequenceSample:
     frames: UInt8[Tensor, "F V H W 4"]  # straight-alpha RGBA of T + 1 frames in V views
     cameras: Cameras  # the V cameras
     fps: float  # frames per second
-    start: int = 0  # number of the first of these frames in its sequence
 
     @property
     def steps(self) -> int:
@@ -55,9 +52,7 @@ class SequenceSample:
     @property
     def facts(self) -> SampleFacts:
         """Description of the sample without its images."""
-        return SampleFacts(
-            self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps, self.start
-        )
+        return SampleFacts(self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps)
 
     def to(self, device: torch.device | str) -> "SequenceSample":
         """The same sample on another device (Lightning moves batches through this)."""
@@ -70,13 +65,9 @@ class SequenceIndex(Dataset):
     As a data set for training it returns only frames 0..T of the training views.
     """
 
-    def __init__(self, objects: Sequence[Any]) -> None:
-        """Lists all sequences of these objects (reads their transforms, but no image).
-
-        Args:
-            objects: each an :class:`gausim.data.objects.ObjectData`, or what has the parts of it that are read here.
-        """
-        self.objects: list[ObjectData] = list(objects)
+    def __init__(self, objects: Sequence[ObjectData]) -> None:
+        """Lists all sequences of these objects (reads their transforms, but no image)."""
+        self.objects = list(objects)
         self.entries: list[tuple[int, SequenceRecord]] = [
             (scene_id, record) for scene_id, item in enumerate(self.objects) for record in item.sequences
         ]
@@ -90,7 +81,7 @@ class SequenceIndex(Dataset):
         Raises:
             DataError: the steps exceed the training frames.
         """
-        sequence, steps, _ = key
+        sequence, steps = key
         item = self.objects[self.entries[sequence][0]]
         if not 1 <= steps < len(item.train_frames):
             raise DataError(

@@ -1,6 +1,6 @@
 """Training order: a pure function of seed and epoch, with a position from which a resumed run continues."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Protocol
 
 import torch
@@ -48,11 +48,8 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         seed: int,
         rank: int = 0,
         world_size: int = 1,
-        frames: Sequence[int] | None = None,
     ) -> None:
         """Divides ``count`` sequences into batches of the plan's size over all ranks.
-
-        ``frames`` are the numbers of frames of the sequences, if samples may start at any frame; else at the first.
 
         Raises:
             ConfigError: a number is out of range, or a batch has fewer sequences than ranks.
@@ -64,7 +61,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
                 f"per optimiser step. Set plan.batch_size={world_size} or a multiple, or trainer.devices={batch_size}."
             )
         self._count, self._batch_size, self._plan, self._seed = count, batch_size, plan, seed
-        self._rank, self._world_size, self._frames = rank, world_size, frames
+        self._rank, self._world_size = rank, world_size
         self.epoch = 0
         # One attribute, so that a cancelled iteration cannot change the position of the next epoch.
         self._dealt = (0, 0)
@@ -107,19 +104,10 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         epoch, position, size = self.epoch, self.position, self._batch_size
         steps, order = self._plan.steps(epoch), self.order(epoch)
         batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
-        starts = self._starts(order, steps)
         for number in range(position if position < len(batches) else 0, len(batches)):
             self._dealt = (epoch, number + 1)
-            first = starts[number * size : (number + 1) * size][self._rank :: self._world_size]
-            yield [SampleKey(*key) for key in zip(batches[number], [steps] * len(first), first, strict=True)]
+            yield [SampleKey(sequence, steps) for sequence in batches[number]]
         self._dealt = (epoch, 0)
-
-    def _starts(self, order: list[int], steps: int) -> list[int]:
-        """The first frame of each sample of the current epoch."""
-        if self._frames is None:
-            return [0] * len(order)
-        draws = torch.rand(len(order), generator=torch.Generator().manual_seed(hash_seed(self._seed + 1, self.epoch)))
-        return [int(draw * (self._frames[i] - steps)) for i, draw in zip(order, draws.tolist(), strict=True)]
 
     def state_dict(self) -> dict[str, int]:
         """Epoch and number of batches already returned in it."""

@@ -54,12 +54,12 @@ class SharedSimulator:
 
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
         """x_0 and x_{-1} of the sequences of a batch."""
-        states = [self.state(s.sequence_id, s.start) for s in samples]
+        states = [self.state(s.sequence_id) for s in samples]
         now, before = torch.cat([s.positions for s in states]), torch.cat([s.previous for s in states])
         return SimState(now.to(batch.rest), before.to(batch.rest))
 
-    def state(self, sequence_id: int, start: int = 0) -> SimState:
-        """The state at which rollouts of a sequence begin; ``start`` is 0 where states of later frames are unknown."""
+    def state(self, sequence_id: int) -> SimState:
+        """The state at which rollouts of a sequence begin."""
         state: SimState = self.states.state(sequence_id)
         return state
 

@@ -9,12 +9,9 @@ from lightning.pytorch.loggers import Logger
 
 from gausim.core import ConfigError
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.pretraining import CorpusDataModule
 from gausim.models.step.simulator import GausSim
-from gausim.models.template.material import MaterialTemplate
 from gausim.runs.names import EPOCHS
 from gausim.training.first_frames import begin_free_bodies
-from gausim.training.material_scan import find_materials
 from gausim.training.module import GausSimModule
 from gausim.training.table import Table
 from gausim.training.trainer import TrainerSettings, make_trainer
@@ -47,11 +44,7 @@ def begin(module: GausSimModule, data: ReadyDataModule, config: Mapping[str, Any
         load(model, source, config["model"])
     if freeze:
         model.freeze(scenes=freeze == "model")
-    if module.initial_states is not None:
-        begin_free_bodies(module, data)
-    decodes = isinstance(model.template, MaterialTemplate)
-    if isinstance(data, CorpusDataModule) and decodes and not data.knows_material and not resumed:
-        find_materials(model, data)
+    begin_free_bodies(module, data)
 
 
 def course(module: GausSimModule, data: ReadyDataModule, config: Mapping[str, Any]) -> list[str]:
@@ -81,7 +74,7 @@ def fit(
     Raises:
         KeyboardInterrupt: it was interrupted.
     """
-    callbacks = settings.callbacks(has_videos=data.has_videos)
+    callbacks = settings.callbacks()
     epochs = module.plan.epochs or 1
     trainer = make_trainer(settings, epochs=epochs, run_dir=run_dir, callbacks=callbacks, loggers=loggers)
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)

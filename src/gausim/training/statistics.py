@@ -53,20 +53,15 @@ class Baselines:
         self._known: dict[int, SequenceBaseline] = {}
 
     def of(self, sample: SequenceSample, rest: Tensor) -> SequenceBaseline:
-        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` are its rest positions.
-
-        That of a sample from a later frame on is not kept.
-        """
-        known = SequenceBaseline()
-        if not sample.start:
-            known = self._known.setdefault(sample.sequence_id, known)
+        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` are its rest positions."""
+        known = self._known.setdefault(sample.sequence_id, SequenceBaseline())
         known.extend(self._supervision, sample, rest)
         return known
 
     def learn(self, samples: Sequence[SampleFacts], baselines: Sequence[SequenceBaseline]) -> None:
         """Stores the ranks' baselines, so that all ranks have the same."""
         found = zip(samples, baselines, strict=True)
-        self._known.update((sample.sequence_id, known) for sample, known in found if not sample.start)
+        self._known.update((sample.sequence_id, known) for sample, known in found)
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """The baseline of each sequence; measuring again in other groups of frames would change the last bits."""

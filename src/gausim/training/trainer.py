@@ -31,7 +31,7 @@ class TrainerSettings(Layout):
     panel_epochs: int = 5
     motion_epochs: int = 10
 
-    def callbacks(self, *, has_videos: bool = True) -> list[Callback]:
+    def callbacks(self) -> list[Callback]:
         """The callbacks that save, report and watch a run."""
         from gausim.training.callbacks.motion_watch import MotionWatch
         from gausim.training.callbacks.panels import Panels
@@ -39,7 +39,7 @@ class TrainerSettings(Layout):
 
         saving = RunCheckpoint(every_minutes=self.checkpoint_minutes, every_steps=self.checkpoint_steps)
         found: list[Callback] = [saving, EpochSummary(console=self.progress)]
-        found += [Panels(every_epochs=self.panel_epochs)] if self.panel_epochs and has_videos else []
+        found += [Panels(every_epochs=self.panel_epochs)] if self.panel_epochs else []
         found += [MotionWatch(every_epochs=self.motion_epochs)] if self.motion_epochs else []
         return [*found, Progress()] if self.progress else found
 

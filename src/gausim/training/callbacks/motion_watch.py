@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
+from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth
 from gausim.nn.mode import evaluating
 from gausim.runs.names import MOTION
@@ -62,7 +62,7 @@ class MotionWatch(Callback):
     def _measure(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first, data = {}, 0, training_data(trainer)
         for scene_id, item in enumerate(data.objects):
-            if scene_id in data.watched and (found := list(self._predicted(module, item, scene_id, first))):
+            if found := list(self._predicted(module, item, scene_id, first)):
                 seen = item.train_frames.stop
                 errors = {"error_seen": _ratio(found, slice(1, seen)), "error_unseen": _ratio(found, slice(seen, None))}
                 rows[item.name] = {name: value for name, value in errors.items() if value is not None}
@@ -70,19 +70,16 @@ class MotionWatch(Callback):
         return rows
 
     def _predicted(
-        self, module: GausSimModule, item: Any, scene_id: int, first: int
+        self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
     ) -> Iterator[tuple[GroundTruth, Tensor]]:
-        """True and predicted motion of each sequence.
-
-        ``item`` is the object, an ``ObjectData`` or a ``BodyData``.
-        """
+        """True and predicted motion of each sequence."""
         points = item.rest_points
         if points is None:
             return
         scene = module.simulator.scenes[scene_id]
         attached = attach_points(scene, points)
         # Unseen frames of the test part, whose sequences have a limit, may not be looked at.
-        shown = [pair for pair in enumerate(item.sequences) if getattr(pair[1], "limit", None) is None]
+        shown = [pair for pair in enumerate(item.sequences) if pair[1].limit is None]
         for number, record in shown[: self.SEQUENCES]:
             truth = item.ground_truth(record)
             if truth is None:

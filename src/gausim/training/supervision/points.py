@@ -16,10 +16,6 @@ from gausim.training.supervision.images import Sources, StaticFigures
 
 # Lower bound of the ratio of predicted to true motion energy in the loss: initial states begin at rest.
 LEAST_RATIO = 0.05
-# Root mean square displacement from rest below which a relative loss is not magnified further [diagonals].
-LEAST_SWING = 1e-3
-# Error over the sequence's mean displacement below which a relative loss is quadratic.
-LEAST_ERROR = 0.02
 # Sequences whose true motion stays in memory.
 MOST_KNOWN = 256
 
@@ -37,7 +33,7 @@ class PointSupervision:
     Nothing is rendered. Only the sample's frames are compared, the same as with supervision by images.
     """
 
-    def __init__(self, sources: Sources, *, energy_weight: float = 0.0, relative: bool = False) -> None:
+    def __init__(self, sources: Sources, *, energy_weight: float = 0.0) -> None:
         """Stores the settings; the true motion is read when a sequence is first shown.
 
         Args:
@@ -45,11 +41,9 @@ class PointSupervision:
             energy_weight: weight of the squared logarithm of predicted over true motion energy. The term is its mean
                 over the halves of a stretch, times the rest state's loss. Without it, the least loss of a motion with a
                 wrong phase is no motion.
-            relative: divide the loss of a sequence by the mean square of its displacement from rest, so that small and
-                large motions count alike. It uses all frames that the source gives, and is meant for pretraining.
         """
         self._scenes, self._read = sources.scenes, sources.truth
-        self._energy_weight, self._relative = energy_weight, relative
+        self._energy_weight = energy_weight
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
@@ -62,31 +56,28 @@ class PointSupervision:
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
         known = [
-            GroundTruth(truth.rest.to(batch.rest), truth.positions[sample.start :].to(batch.rest))
+            GroundTruth(truth.rest.to(batch.rest), truth.positions.to(batch.rest))
             for sample, truth in zip(samples, truths, strict=True)
         ]
-        return _PointComparison(batch, known, attached, scales, self._energy_weight, root=self._relative)
+        return _PointComparison(batch, known, attached, scales, self._energy_weight)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Losses of the rest state on frames ``first`` .. T of a sample."""
         truth = self.motion(sample)
-        positions = truth.positions[sample.start + first : sample.start + sample.steps + 1]
+        positions = truth.positions[first : sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
         losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / LEAST_RATIO) ** 2)
-        scaled = _distance(self._scale(sample) * losses) if self._relative else self._scale(sample) * losses
-        return StaticFigures(scaled.tolist(), (self._scale(sample) * motion).tolist())
+        scale = self._scale(sample)
+        return StaticFigures((scale * losses).tolist(), (scale * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
         diagonal = self._scenes[sample.scene_id].diagonal
-        if self._relative:
-            truth = self.motion(sample)
-            return 1 / max(float(_squared(truth.positions - truth.rest).mean()), (LEAST_SWING * diagonal) ** 2)
         return (100 / diagonal) ** 2
 
     def displacements(self, sample: SequenceSample) -> Float[Tensor, "F K 3"]:
         """Displacements of all kernels from rest, each that of its nearest point, frame 0 first [scene units]."""
         truth = self.motion(sample)
-        moved = truth.positions[sample.start : sample.start + sample.steps + 1] - truth.rest
+        moved = truth.positions[: sample.steps + 1] - truth.rest
         return moved[:, _nearest(self._scenes[sample.scene_id].means.to(truth.rest), truth.rest)]
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
@@ -114,10 +105,7 @@ class _PointComparison:
         attached: Sequence[Int[Tensor, " _"]],
         scales: Sequence[float],
         energy_weight: float,
-        *,
-        root: bool,
     ) -> None:
-        self._root = root
         self._batch, self._truths, self._scales = batch, truths, scales
         self._energy_weight = energy_weight
         self._kernels, self._units, self._offsets = [], [], []
@@ -141,7 +129,7 @@ class _PointComparison:
                 true_steps = truth.positions[start : span.stop].diff(dim=0)
                 still, energies = _squared(truth.positions[span] - truth.rest), (_squared(steps), _squared(true_steps))
                 loss = loss + self._energy_weight * still * _energy_mismatch(*energies)
-            losses.append(_distance(scale * loss) if self._root else scale * loss)
+            losses.append(scale * loss)
             motion += scale * _squared(steps.detach()).sum()
             self._last[i] = points[-1].detach()
         return torch.stack(losses, 1), motion
@@ -153,11 +141,6 @@ def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Fl
     energies = torch.stack([torch.stack((a.mean(), b.mean())) for a, b in halves])
     least = LEAST_RATIO * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
     return ((energies[:, 0] + least) / (energies[:, 1] + least)).log().square().mean()
-
-
-def _distance(squares: Float[Tensor, " T"]) -> Float[Tensor, " T"]:
-    """Root of squared errors, with a finite derivative at zero."""
-    return (squares + LEAST_ERROR**2).sqrt() - LEAST_ERROR
 
 
 def _nearest(points: Float[Tensor, "P 3"], others: Float[Tensor, "Q 3"]) -> Int[Tensor, " P"]:
