@@ -19,6 +19,8 @@ RUN ?= outputs/demo/seed_0
 DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Empty: commands and tests start many processes, and each would compile every module that it imports.
+export PYTHONDONTWRITEBYTECODE :=
 # Bytecode of what a command imports is made when it does; of everything that is installed it takes half a minute.
 INSTALL = $(BIN)/python -m pip install -q --no-compile -c constraints.txt
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
