@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from benchmarks.harness import Options, Row, cloud, medians, peak_saved_bytes, s
 from gausim.core import GaussianScene, SimState
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.step.simulator import GausSim
+from gausim.runs.cost import process_memory
 
 # Kernels, units of levels 1 and 2, settings of the network: the paper's, and a quick one.
 SIZES = {
@@ -52,23 +54,37 @@ def levels_of(scene: GaussianScene, units: Sequence[int]) -> str:
 
 
 def _beside(models: dict[str, GausSim], reference: str, options: Options) -> list[Row]:
-    """Figures of each model, and the second's over the first's."""
+    """Figures of each model, and the second's over the first's; no backward pass where memory is too small."""
     bound = {name: _Bound(model, options) for name, model in models.items()}
+    first, second = models
     forward = medians({name: one.forward for name, one in bound.items()}, options)
-    both = medians({name: one.both for name, one in bound.items()}, options)
-    kept = {name: float(peak_saved_bytes(one.differentiable)) for name, one in bound.items()}
+    kept = {first: float(peak_saved_bytes(bound[first].differentiable))}
+    needed = 1.5 * kept[first] * bound[second].edges / bound[first].edges
+    if needed > _free_memory(options.device):
+        print(
+            f"step: about {needed / 2**30:.0f} GiB are not free, so '{second}' has no backward pass.", file=sys.stderr
+        )
+    else:
+        kept[second] = float(peak_saved_bytes(bound[second].differentiable))
+    both = medians({name: bound[name].both for name in kept}, options)
     figures = {"forward": (forward, 1e3, "ms"), "forward + backward": (both, 1e3, "ms")}
     figures["kept for the backward pass"] = kept, 2**-20, "MiB"
-    first, second = models
     rows = []
     for name, one in bound.items():
         case = f"step, {one.kernels} kernels, {one.units} units, {name}"
         rows.append(Row(case, "edges", one.edges, "1"))
         for metric, (values, scale, unit) in figures.items():
-            rows.append(Row(case, metric, scale * values[name], unit))
-            if name == second:
+            rows += [Row(case, metric, scale * values[name], unit)] if name in values else []
+            if name == second and second in values:
                 rows.append(Row(case, f"{metric} / {first}", values[second] / values[first], "x", reference))
     return rows
+
+
+def _free_memory(device: torch.device) -> int:
+    """Memory available without swapping [bytes]."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    return process_memory("MemAvailable", "/proc/meminfo") or sys.maxsize
 
 
 class _Bound:
