@@ -1,5 +1,6 @@
 """The training plan: what it decides for every recipe, and that a saved configuration states what ran."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,7 +15,8 @@ from gausim.nn.schedules import CosineSchedule, HalvingSchedule
 from gausim.training.module import GausSimModule
 from gausim.training.plan import DataFacts, TrainingPlan, WarmStart
 
-HELD, FREE = DataFacts(12, 16, can_warm_start=True), DataFacts(12, 16, can_warm_start=False)
+HELD, COLD = DataFacts(12, 16, can_warm_start=True), DataFacts(12, 16, can_warm_start=False)
+FREE = replace(COLD, free=True)
 GROUPS = ("network", "scene", "template", "initial")
 
 
@@ -31,7 +33,8 @@ def cosine(part: float) -> float:
 
 @pytest.mark.parametrize(("overrides", "data", "epochs", "steps", "factors"), [
     (["model=gausim"], HELD, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5), 29: cosine(29 / 30)}),
-    (["model=gausim"], FREE, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
+    (["model=gausim"], FREE, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5)}),
+    (["model=gausim"], COLD, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
     (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),
     (["model=gausim", "plan.t_start=3"], HELD, 30, {0: 3, 1: 4, 12: 15}, {15: cosine(0.5)}),
     (["model=gausim", "plan.warm_start=null"], HELD, 60, {0: 2, 13: 15}, {30: cosine(0.5)}),

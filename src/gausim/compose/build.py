@@ -143,7 +143,8 @@ def _resolved_plan(config: DictConfig, datamodule: ReadyDataModule) -> TrainingP
     if "method" not in config.model:
         can = _can_warm_start(config, datamodule)
         held = can and any(record.hands is not None for _, record in datamodule.index.entries)
-        return plan.resolved(DataFacts(count, frames, can, can and not held), ranks=ranks)
+        free = any(item.surroundings.free for item in datamodule.objects)
+        return plan.resolved(DataFacts(count, frames, can, can and not held, free), ranks=ranks)
     # The sequences are fitted independently, in stages of their own.
     own = instantiate(config.model.plan)
     plan = replace(plan, epochs=max(1, own.epochs), repeats=own.shows, batch_size=plan.batch_size or 1)

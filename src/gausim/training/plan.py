@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from gausim.core import ConfigError
 from gausim.nn.schedules import CosineSchedule, HalvingSchedule, Schedule
 
-# Epochs after a warm start, and without one; predicted frames in the first epoch without one.
+# Epochs where T is largest from the beginning, and where it grows; predicted frames in the first epoch then.
 WARM_EPOCHS, COLD_EPOCHS, FIRST = 30, 60, 2
 # Predicted frames to which T grows by one at an increase, and the most that are chosen for longer videos: memory and
 # time of an optimiser step grow with T.
@@ -90,6 +90,7 @@ class DataFacts:
     frames: int  # seen frames, of the object that has fewest
     can_warm_start: bool  # whether the motion can be tracked: no body is free, none is above a floor
     can_teach: bool | None = None  # and no body is in hands; None: as ``can_warm_start``
+    free: bool = False  # whether bodies are free, whose first frames are known from their silhouettes
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,11 @@ class TrainingPlan:
     Null values follow from the data; :meth:`resolved` sets them, and the saved configuration of a run states them.
 
     Attributes:
-        epochs: epochs of the training; None: 30 after a warm start, else 60.
+        epochs: epochs of the training; None: 30 where T is largest from the beginning, else 60.
         repeats: shows of each sequence per epoch.
         batch_size: sequences per optimiser step, divided among the ranks; None: a third of all, 1 to 4.
-        t_start: predicted frames T in epoch 0; None: ``t_max`` after a warm start, else 2.
+        t_start: predicted frames T in epoch 0; None: ``t_max`` after a warm start and for free bodies, of which short
+            rollouts show no deformation, else 2.
         t_max: most predicted frames; None: all seen frames, at most 60.
         schedule: factor on all learning rates by the part that is done: ``cosine``, ``halving`` (METHOD section 4) or
             another schedule; None: constant.
@@ -156,14 +158,14 @@ class TrainingPlan:
                 f"plan.t_max: {t_max} predicted frames would see frame {t_max}, but training sees frames "
                 f"0..{data.frames - 1}; expected at most {data.frames - 1}."
             )
-        first = t_max if warm or teach else min(FIRST, t_max)
+        begun = bool(warm or teach or data.free)
         return replace(
             self,
             warm_start=warm,
             teach=teach,
             t_max=t_max,
-            t_start=first if self.t_start is None else self.t_start,
-            epochs=self.epochs or (WARM_EPOCHS if warm or teach else COLD_EPOCHS),
+            t_start=self.t_start or (t_max if begun else min(FIRST, t_max)),
+            epochs=self.epochs or (WARM_EPOCHS if begun else COLD_EPOCHS),
             batch_size=self.batch_size or max(ranks, min(4, data.sequences // 3)),
         )
 
