@@ -33,13 +33,15 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(toy: Path, t
     live = open_scene(body, fps=24.0, base=base)
     live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.02))
     amplitudes = {}
-    for stiffness in (1.0, 4.0):
+    for stiffness in (1.0, 0.25, 4.0):
         live.act(Material(stiffness, damping=10.0))
-        amplitudes[stiffness] = float([live.step() for _ in range(24)][-1].positions[8, 0] - body.means[8, 0])
-    assert amplitudes[4.0] == pytest.approx(amplitudes[1.0] / 4, rel=0.2)  # bends as a spring does
+        amplitudes[stiffness] = float([live.step() for _ in range(48)][-1].positions[8, 0] - body.means[8, 0])
+    assert amplitudes[0.25] == pytest.approx(4 * amplitudes[1.0], rel=0.2)  # bends as a spring does
+    assert amplitudes[4.0] == pytest.approx(amplitudes[1.0] / 4, rel=0.2)
     last = live.frame.positions
     again = open_scene(body, fps=24.0, base=base)
     assert torch.equal(replay(again, live.session()).positions[-1], last)
+    assert torch.equal(replay(live, live.session()).positions[-1], last)  # which begins with the first material
     alone = [open_scene(body, fps=24.0, stiffness=given, sway=0.02) for given in (None, 4.0)]
     assert not torch.equal(*(live.step().positions for live in alone))  # the template without a network has one, too
     with pytest.raises(ConfigError, match="--stiffness -1: expected a number > 0"):

@@ -98,7 +98,7 @@ def spring_pull_of(form: Callable[..., Any], first: Tensor, second: Tensor, *x: 
 
 
 Form, Case = Callable[..., Any], tuple[Operation[..., Any], Callable[..., Any], tuple[Tensor, ...]]
-SIZES = [(17, 23, 5), (6, 40, 5), (33, 7, 5), (5, 5, 5), (9, 8, 5), (21, 11, 11)]  # height, width, window
+SIZES = [(17, 23, 5), (6, 40, 5), (33, 7, 5), (5, 5, 5), (9, 8, 3), (21, 11, 11)]  # height, width, window
 BOXES = [(slice(10, 20), slice(12, 30)), (slice(0, 9), slice(25, 38)), (slice(30, 31), slice(3, 4))]
 CORNERS = [(0, 0, 0), (1, 0, -1), (0, -1, 0), (1, -1, -1), (0, 10, 1)]
 CASES: dict[str, Case] = {
