@@ -31,8 +31,7 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> None:
             faults = _warn_of_data(job.data) if cfg.doctor and not in_sweep() and is_first() else []
             facts = train(job, run, notes={"data_faults": faults} if faults else {})
             if is_first():
-                evaluable = not cfg.evaluate
-                commands = [["evaluate", run.path], ["report", run.path]] if evaluable else []
+                commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
                 end(_result(facts, job.config.plan), "run", run.path, *commands)
     if cfg.evaluate:
         _evaluate(run)
