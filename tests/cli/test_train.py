@@ -70,7 +70,9 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(arguments, c
     assert all(torch.equal(value, alone[name]) for name, value in weights(RUN).items())
 
     watched = rows(RUN / "motion.csv")
-    assert [(r["epoch"], r["object"]) for r in watched] == [("1", "toy"), ("2", "toy")]
+    assert [(r["epoch"], r["object"]) for r in watched] == [(epoch, "toy") for epoch in "012"]
+    spent = [float(row["cpu_seconds"]) for row in watched]
+    assert 0 < spent[0] < spent[1] < spent[2]
     assert evaluate.main([str(RUN)]) == 0
     table = load_results(RUN / "evaluation" / "metrics.json").table
     found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim", "points")}

@@ -1,5 +1,6 @@
 """Motion errors during training, on seen and unseen frames."""
 
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -24,34 +25,52 @@ class MotionWatch(Callback):
     """Predicts the first training sequences of every object whose true motion is known, and measures the errors.
 
     It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. Errors are
-    over the static prediction's. Rows go to ``motion.csv`` of the run, means over objects to every logger.
+    over the static prediction's, ``cpu_seconds`` the processor time of the training without that of this callback.
+    Rows go to ``motion.csv`` of the run, means over objects to every logger. Epoch 0 is after the plan's first stages.
     """
 
-    COLUMNS = ("epoch", "step", "object", "error_seen", "error_unseen")
+    COLUMNS = ("epoch", "step", "object", "cpu_seconds", "error_seen", "error_unseen")
     SEQUENCES = 4  # of each object
 
     def __init__(self, *, every_epochs: int = 10) -> None:
-        """Measures every ``every_epochs`` epochs (0: never) and after the last."""
+        """Measures before the first epoch, every ``every_epochs`` epochs and after the last; never if it is 0."""
         if every_epochs < 0:
             raise ConfigError(f"trainer.motion_epochs: expected at least 0, got {every_epochs}.")
-        self._every = every_epochs
+        self._every, self._spent = every_epochs, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Drops rows of epochs that a resumed run repeats."""
         if trainer.is_global_zero:
             self._table(trainer).resume_at(trainer.current_epoch)
 
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Measures what the first stages have reached."""
+        if trainer.is_global_zero and self._every and trainer.global_step == 0:
+            self._write(trainer, pl_module, 0)
+
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Measures if the epoch is due."""
-        if not (trainer.is_global_zero and has_come(trainer, self._every)):
-            return
-        assert isinstance(pl_module, GausSimModule)
-        with undisturbed(), torch.no_grad(), evaluating(pl_module):
-            rows = self._measure(trainer, pl_module)
+        if trainer.is_global_zero and has_come(trainer, self._every):
+            self._write(trainer, pl_module, trainer.current_epoch + 1)
+
+    def state_dict(self) -> dict[str, float]:
+        """Processor time of the measurements [s]."""
+        return {"spent": self._spent}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Restores the time."""
+        self._spent = state_dict["spent"]
+
+    def _write(self, trainer: Trainer, module: LightningModule, epoch: int) -> None:
+        assert isinstance(module, GausSimModule)
+        began, spent = time.process_time(), 60 * module.cost.minutes("cpu") - self._spent
+        with undisturbed(), torch.no_grad(), evaluating(module):
+            rows = self._measure(trainer, module)
+        self._spent += time.process_time() - began
         for name, row in rows.items():
-            place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
+            place = {"epoch": epoch, "step": trainer.global_step, "object": name, "cpu_seconds": short(spent)}
             self._table(trainer).append({**place, **{key: short(value) for key, value in row.items()}})
-        values = {key: [row[key] for row in rows.values() if key in row] for key in self.COLUMNS[3:]}
+        values = {key: [row[key] for row in rows.values() if key in row] for key in self.COLUMNS[4:]}
         means = {f"motion/{key}": float(np.mean(known)) for key, known in values.items() if known}
         for logger in trainer.loggers if means else ():
             logger.log_metrics(means, step=trainer.global_step)
