@@ -156,6 +156,7 @@ def test_forces_move_fast_modes_as_far_as_they_should() -> None:
     turns = 2 * torch.atan(squares.sqrt() / 2) * torch.arange(1, 21)[:, None]
     torch.testing.assert_close(swings, velocities / squares.sqrt() * torch.sin(turns), atol=1e-5, rtol=1e-3)
     part.damping = 0.2 * (part.inertia + part.stiffness / 4)
+    vars(part).pop("_reached")  # what was computed with the damping of 0
     still = torch.linalg.solve(part.stiffness, part.mass @ speed)
     torch.testing.assert_close(rollout(150, 150)[-1], still, atol=1e-6, rtol=1e-3)
 

@@ -60,14 +60,13 @@ class EnergyGuard:
         """
         if not self._last:
             self._last.append(self._model.template.headroom * self._energy(state))
-        if force is not None:
-            pushed = self._model.pushed(self._prepared, state, force)
-            work = max(0.0, self._energy(pushed) - self._energy(state))
-            self._last = deque((energy + work for energy in self._last), self._last.maxlen)
-        result = self._step(state, force)
+        pushed = state if force is None else self._model.pushed(self._prepared, state, force)
+        work = max(0.0, self._energy(pushed) - self._energy(state)) if force is not None else 0.0
+        self._last = deque((energy + work for energy in self._last), self._last.maxlen)
+        result = self._step(pushed, None)
         energy, limit = self._energy(result.following(state)), max(self._last)
         if energy > limit:
-            result, energy = self._held_back(state, force, energy, limit)
+            result, energy = self._held_back(pushed, energy, limit)
         if self._ceiling is not None and not self._is_below(result.positions, state, self._ceiling):
             self.limited += 1
             result, energy = self._limited(result, state, force, self._ceiling)
@@ -117,12 +116,12 @@ class EnergyGuard:
         rotations = polar_rotation(turned + scale * (frame.rotations - turned))
         return Frame(positions, deformation_gradients, rotations)
 
-    def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Frame, float]:
+    def _held_back(self, state: SimState, energy: float, limit: float) -> tuple[Frame, float]:
         self.held += 1
-        alone, lowest = self._corrected(state, force, 0.0)
+        alone, lowest = self._corrected(state, None, 0.0)
         if lowest >= limit:
             return alone, lowest
-        part, reached = self._corrected(state, force, (limit - lowest) / (energy - lowest))
+        part, reached = self._corrected(state, None, (limit - lowest) / (energy - lowest))
         return (part, reached) if reached <= limit else (alone, lowest)
 
     def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[Frame, float]:

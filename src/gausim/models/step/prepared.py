@@ -1,7 +1,10 @@
 """Constants of a step, computed once for all steps between two updates of the parameters."""
 
+import warnings
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -37,8 +40,35 @@ class Prepared:
     reference: Reference  # of bodies that move as a whole, or in hands
 
     def mean(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
-        """Centres of mass of the finest predicted units."""
+        """Centres of mass of the finest predicted units; without loss gradients by a sparse product on the CPU."""
+        if positions.device.type == "cpu" and not torch.is_grad_enabled():
+            for known, version, mean in self._latest:
+                if known is positions and known._version == version:
+                    return mean
+            self._latest.append((positions, positions._version, self._sums @ positions))
+            return self._latest[-1][2]
         return weighted_sum(positions, self.mass_fraction, self.batch.finest, self.batch.levels[-1].count)
+
+    @cached_property
+    def _latest(self) -> deque[tuple[Tensor, int, Tensor]]:
+        """Positions, their version and mean: a step and its energies ask for the same ones."""
+        return deque(maxlen=4)
+
+    @cached_property
+    def _sums(self) -> Float[Tensor, "N K"]:
+        """The matrix of :meth:`mean`."""
+        (unit, order), count = torch.sort(self.batch.finest, stable=True), self.batch.levels[-1].count
+        starts = torch.searchsorted(unit, torch.arange(count + 1, device=unit.device))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sparse")  # that its interface may change
+            return torch.sparse_csr_tensor(starts, order, self.mass_fraction[order], (count, len(unit)))
+
+    @cached_property
+    def yielding(self) -> Float[Tensor, "K 1"]:
+        """Displacement of every kernel in a frame per force on it; 0 for those that no force moves."""
+        batch = self.batch
+        shift = (batch.dt**2 / (2 * self.mass[:, None])).masked_fill(batch.pinned[:, None], 0.0)
+        return torch.zeros_like(batch.rest[:, :1]).index_copy(0, batch.simulated, shift)
 
     def finest(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """:meth:`mean` in the axes of the template."""
@@ -61,13 +91,12 @@ class Prepared:
     def _in_own_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return self.frames.into(len(self.levels) - 1, positions)
 
-    def overshoot(self, state: SimState, displacement: Float[Tensor, "M 3"]) -> Float[Tensor, "M 3"]:
-        """The part of a displacement of the simulated kernels by an impulse that its frame does not reach."""
-        batch, turned, axes = self.batch, self.reference.turned(state), self.frames.axes[-1]
+    def overshoot(self, state: SimState, displacement: Float[Tensor, "K 3"]) -> Float[Tensor, "K 3"]:
+        """The part of a displacement by an impulse that its frame does not reach, of the units of all kernels."""
+        turned, axes = self.reference.turned(state), self.frames.axes[-1]
         axes = axes if turned is None else axes @ turned.mT
-        shifted = self.mean(torch.zeros_like(state.positions).index_copy(0, batch.simulated, displacement))
-        remainder = apply(axes.mT, self.template.overshoot(apply(axes, shifted)))
-        return remainder.index_select(0, batch.finest.index_select(0, batch.simulated))
+        remainder = apply(axes.mT, self.template.overshoot(apply(axes, self.mean(displacement))))
+        return remainder.index_select(0, self.batch.finest)
 
     def per_level(self, finest: Float[Tensor, "N C"]) -> list[Tensor]:
         """Values of every predicted level, coarse to fine, such as positions: means of the finer units by mass."""

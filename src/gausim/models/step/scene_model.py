@@ -149,13 +149,11 @@ class SceneModel(nn.Module, ABC):
         The paper's is x_t + f dt^2 / (2 m). In templates with modes x_{t-1} gives the same velocity, f dt / m, less
         what its frame does not reach (:meth:`gausim.models.template.modal.ModalScene.overshoot`).
         """
-        batch = prepared.batch
-        shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
-        shift = shift.masked_fill(batch.pinned[:, None], 0.0)
+        shift = force * prepared.yielding
         if not self.knows_energy:
-            return replace(state, positions=state.positions.index_add(0, batch.simulated, shift))
-        gained = (2 * shift - prepared.overshoot(state, 2 * shift)).masked_fill(batch.pinned[:, None], 0.0)
-        return replace(state, previous=state.previous.index_add(0, batch.simulated, gained, alpha=-1))
+            return replace(state, positions=state.positions + shift)
+        gained = torch.where(prepared.yielding > 0, 2 * shift - prepared.overshoot(state, 2 * shift), 0.0)
+        return replace(state, previous=state.previous - gained)
 
     @property
     def knows_energy(self) -> bool:

@@ -69,6 +69,7 @@ class FiniteStrain(nn.Module):
     gradients: Tensor  # H_m, displacement gradients of the modes near the units, row by row (9 N, M) [1 / scene units]
     volume: Tensor  # w of the cells near each unit (N,)
     measures: Tensor  # derivatives of the seven measures of sym(F^T H) with respect to F and H (9, 7 x 9)
+    linear: Tensor  # products of what the measures at rest are of H (7, 81)
     moduli: Tensor  # of shear and of volume in the energy of each measure (2, 7)
 
     def __init__(self, gradients: np.ndarray, volume: np.ndarray, *, scale: float = 1.0) -> None:
@@ -78,6 +79,8 @@ class FiniteStrain(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
         moduli = torch.tensor([6 * [2 * SECOND] + [0.0], 6 * [0.0] + [FIRST]])
         self.register_buffer("measures", _measures(), persistent=False)
+        rest = (torch.eye(3).flatten() @ self.measures).unflatten(-1, (7, 9))
+        self.register_buffer("linear", (rest[:, :, None] * rest[:, None]).flatten(1), persistent=False)
         self.register_buffer("moduli", moduli, persistent=False)
 
     def reference_strain(self, strain: Float[Tensor, "S N 9"]) -> Float[Tensor, "S N 3 3"]:
@@ -119,11 +122,11 @@ class FiniteStrain(nn.Module):
             least = (own - (stress.abs().sum(-1) - own.abs())).amin(-1)  # Gershgorin's bound of the eigenvalues
             stress = stress + (-least).clamp_min(0)[..., None, None] * one
         weight = ((self.volume[:, None] * factor) @ self.moduli)[..., None]
-        mean, last, rest = (
-            (f.flatten(-2) @ self.measures).unflatten(-1, (7, 9)) for f in (gradient + one, second.gradient + one, one)
+        mean, last = (
+            (f.flatten(-2) @ self.measures).unflatten(-1, (7, 9)) for f in (gradient + one, second.gradient + one)
         )
         # Blocks (9, 9) of every unit, by rows and columns of what is pulled and of what moves.
-        blocks = (1 + 2 * damping) * mean.mT @ (weight * last) - rest.mT @ (weight * rest)
+        blocks = (1 + 2 * damping) * mean.mT @ (weight * last) - (weight.mT @ self.linear).unflatten(-1, (9, 9))[:, 0]
         blocks.unflatten(-1, (3, 3)).unflatten(-3, (3, 3)).diagonal(dim1=-4, dim2=-2).add_(stress[..., None])
         turned = blocks @ self.gradients.unflatten(0, (-1, 9))
         return self.gradients.mT @ turned.flatten(-3, -2)

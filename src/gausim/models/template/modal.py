@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -236,12 +237,15 @@ class ModalScene:
         round by v in every frame. 1 - t is what damping leaves of it in this step, for the slow modes: with it, a
         steady force ends where stiffness balances it.
         """
+        z = (displacement.flatten(1) @ self.projection).mT
+        return ((z - self._reached @ z).mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
+
+    @cached_property
+    def _reached(self) -> Float[Tensor, "M M"]:
         whole = self.inertia + self.stiffness / 4
         inverse, slow = (torch.linalg.inv_ex(a)[0] for a in (whole, self.stiffness))  # without waiting for a device
         lost = (slow * self.damping).sum() / (2 * (slow * whole).sum())
-        z = (displacement.flatten(1) @ self.projection).mT
-        held = z - inverse @ self.mass @ z / (1 - lost).clamp_min(LEAST_LEFT)
-        return (held.mT @ self.motions.mT).unflatten(1, (-1, 12))[..., :3]
+        return inverse @ self.mass / (1 - lost).clamp_min(LEAST_LEFT)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """v^T M v / 2 + m^T K m / 2 + the nonlinear part, with v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2.
