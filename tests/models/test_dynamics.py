@@ -1,5 +1,6 @@
 """Rollouts: what steps give, memory of earlier frames, divergence."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state
 
-from gausim.core import ConfigError, DivergenceError, Dynamics, GaussianScene, SimState
+from gausim.core import ConfigError, DivergenceError, Dynamics, Frame, GaussianScene, SimState
 from gausim.core.surroundings import Surroundings
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.rollout.energy_guard import EnergyGuard
@@ -136,6 +137,8 @@ def test_a_rollout_carries_the_frames_that_the_network_sees() -> None:
     after = first.following(state)
     assert torch.equal(after.positions, first.positions) and torch.equal(after.previous, state.positions)
     assert torch.equal(after.older[0], state.previous) and len(after.older) == 2
+    force = torch.ones(60, 3)
+    assert torch.equal(model.step(batch, state, force).following(state).previous, state.positions)
     other = replace(after, older=(after.older[0], after.older[1] + 0.1))
     assert not torch.allclose(model.step(batch, after).positions, model.step(batch, other).positions)
     with torch.no_grad():
@@ -221,6 +224,39 @@ def test_a_held_back_step_takes_the_share_of_its_formula() -> None:
     assert guard.held == 1 and low < limit < high and energies[-1] <= limit
     assert 0.01 < share < 0.99
     assert torch.equal(state.positions, model.step(batch, start, None, prepared, share).positions)
+
+
+GROWTH, TURN = 1.02, 0.5  # of an oscillation per frame, and its angular frequency [1 / frame]
+
+
+@torch.no_grad()
+def test_what_a_taught_network_makes_grow_dies_away_with_the_guard(monkeypatch) -> None:
+    scene = make_scene(dtype=torch.float64)
+    model = make_model(scene, energy_guard_frames=24).eval()
+    free = (scene.simulated & ~scene.pinned)[:, None].double()
+
+    def growing(batch, state, force, prepared, *_):
+        state = state if force is None else model.pushed(prepared, state, force)
+        now, before = state.positions - scene.means, state.previous - scene.means
+        after = free * (2 * GROWTH * math.cos(TURN) * now - GROWTH**2 * before)
+        return Frame(scene.means + after, *prepared.reference.undeformed(state))
+
+    monkeypatch.setattr(model, "step", growing)
+    still = SimState(scene.means, scene.means)
+    bent = SimState(make_state(scene).positions, scene.means)
+
+    def away(state: SimState, frames: int, push: torch.Tensor | None = None) -> list[float]:
+        made = SceneDynamics(model).rollout(state, frames, forces=lambda n: push if n == 2 else None)
+        return (made.positions - scene.means).flatten(1).norm(dim=1).tolist()
+
+    push = SceneDynamics(model).masses[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    alone, driven = away(bent, 200), away(still, 40, push)
+    model.template.frequencies[0].fill_(TURN)
+    bounded, kept = away(bent, 200), away(still, 40, push)
+    assert max(alone[100:]) > 5 * max(alone[:100]) and max(away(still, 40)) == 0.0
+    assert max(bounded[150:]) < 0.9 * max(bounded[:50]) and max(bounded[150:]) > 0.3 * max(bounded[:50])
+    assert max(kept[:8]) == pytest.approx(max(driven[:8]), rel=0.1)  # a quarter of a period after the push
+    assert max(kept[20:]) <= max(kept[:20])
 
 
 def test_a_ceiling_bounds_what_forces_do() -> None:

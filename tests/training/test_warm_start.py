@@ -172,6 +172,9 @@ def test_a_network_that_is_taught_an_oscillator_has_learned_its_flow(long_toy: P
     module.model.eval()
     untaught = left()
     begin(module, data, module.plan, seed=0, quiet=True)
+    own = torch.stack([known.moved[:16] for known in whole])
+    speed, middle = own.diff(dim=1).square().sum(), ((own[:, 1:] + own[:, :-1]) / 2).square().sum()
+    assert float(module.model.template.frequency(0)) == pytest.approx(float((speed / middle).sqrt()), rel=0.05)
     module.model.eval()
     assert left() < 0.1 * untaught
 

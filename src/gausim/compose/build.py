@@ -23,6 +23,7 @@ from gausim.render.auto import AutoRenderer
 from gausim.render.cpu import CpuRenderer
 from gausim.render.gsplat import GsplatRenderer
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
+from gausim.runs.choices import hydra_record
 from gausim.runs.data_print import changed_files
 from gausim.runs.directory import RunDirectory
 from gausim.runs.names import TEST
@@ -192,5 +193,7 @@ def _load(
     check_scenes(loaded, module.scenes, str(directory.checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)
+    if isinstance(module, GausSimModule) and (name := hydra_record(directory.path)[1].get("model")):
+        module.method.name = name
     module.eval()
     return config, module, datamodule

@@ -5,7 +5,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from gausim.report.runs import INIT_FROM, RunRecord, dig
+from gausim.report.runs import INIT_FROM, RunRecord
+from gausim.runs.choices import dig
 
 FULL = "full"
 # Names of ablations in tables, in the paper's order of rows; others keep theirs and follow.

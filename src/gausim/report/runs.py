@@ -17,8 +17,9 @@ import yaml
 from gausim.core import RunError
 from gausim.io.files import natural, read_yaml
 from gausim.results.table import ObjectInfo, Results, load_results
+from gausim.runs.choices import dig, hydra_record
 from gausim.runs.comparison import flatten
-from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
+from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, HYDRA, LAST_CHECKPOINT
 
 # Files that identify a run whose configuration is unreadable.
 _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
@@ -28,7 +29,6 @@ _FREE = ("output_root", "logger", "trials", "retry_failed", "evaluate", "seed", 
 INIT_FROM, _SEED_FOLDER = "init_from", re.compile(r"seed_\d+/?$")
 _DIGITS = 12  # of hashes and commits
 _SWEEP = "multirun.yaml"  # Hydra's record of a sweep
-_HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
 
 EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
 FAILURE, BROKEN = "failed", "broken files"
@@ -151,7 +151,7 @@ def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
         if CONFIG in files and _is_run(folder):
             folders.clear()
             alive.append(folder)
-        elif (folder / _HYDRA / CONFIG).is_file():
+        elif (folder / HYDRA / CONFIG).is_file():
             dead.append(folder)
     dead = [d for d in dead if not any(a.is_relative_to(d) for a in alive)]
     yield from sorted(alive + dead, key=lambda folder: [natural(part) for part in folder.parts])
@@ -165,15 +165,10 @@ def _is_run(folder: Path) -> bool:
 
 
 def _read_run(folder: Path, name: str) -> RunRecord:
-    try:
-        job = read_yaml(folder / _HYDRA / "hydra.yaml")
-    except ValueError:
-        job = {}
-    chosen = dig(job, "hydra", "runtime", "choices")
-    choices = {str(k): str(v) for k, v in chosen.items()} if isinstance(chosen, dict) else {}
+    job, choices = hydra_record(folder)
     made = partial(RunRecord, folder, name, choices=choices, command=_command(folder, job))
     is_run = (folder / CONFIG).is_file()
-    path = (folder if is_run else folder / _HYDRA) / CONFIG
+    path = (folder if is_run else folder / HYDRA) / CONFIG
     try:
         config = read_yaml(path)
     except ValueError as error:
@@ -228,10 +223,3 @@ def _progress(folder: Path) -> str:
     except (OSError, csv.Error):
         rows = []
     return f"epoch {rows[-1].get('epoch')}" if rows else "no epoch done"
-
-
-def dig(node: Any, *keys: str) -> Any:
-    """The value in nested dictionaries under these keys; None if there is none."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node

@@ -6,3 +6,4 @@ EVALUATION = "evaluation/metrics.json"
 TEST = "evaluation/test.json"  # looks at the test part
 EPOCHS = "epochs.csv"  # one row per epoch
 MOTION = "motion.csv"  # statistics of the predicted motion, every few epochs
+HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run

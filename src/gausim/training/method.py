@@ -22,7 +22,7 @@ class SharedSimulator:
     ``initial_states`` (:mod:`gausim.models.initial_state`) have one parameter per training sequence, in their order.
     """
 
-    name = "gausim"
+    name = "gausim"  # in tables: that of the model's file
     initial_states: nn.Module
 
     def __init__(

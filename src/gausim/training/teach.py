@@ -27,6 +27,7 @@ from gausim.core import SimState
 from gausim.data.sampler import hash_seed
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.template import RestTemplate
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.nn.schedules import CosineSchedule
 from gausim.runs.bar import with_bar
@@ -169,6 +170,9 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
         fitted: whether densities, attributes and template are fitted; single steps then train the network alone.
     """
     lesson, normalisers = Lesson(learner, model, tracks, settings, seed), normalisers_of(model)
+    if isinstance(model.template, RestTemplate):
+        for scene_id, known in enumerate(model.template.frequencies):
+            known.fill_(_frequency([track.moved for track in tracks if track.scene_id == scene_id]))
     model.train()
     with torch.no_grad():
         for starts in lesson.pairs():
@@ -185,6 +189,13 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
             rate = settings.roll_factor
             left = descend(learner, lesson, groups, _rolls(lesson, settings), rate, "Teaching rollouts", quiet)
             print(f"  roll: rollouts on the tracks leave {left:.3f} of the motion", flush=True)
+
+
+def _frequency(motions: Sequence[Float[Tensor, "F K 3"]]) -> float:
+    """Angular frequency of an oscillator with the ratio of their mean velocities and displacements [1 / frame]."""
+    speed = sum(float(u.diff(dim=0).square().sum()) for u in motions)
+    away = sum(float(((u[1:] + u[:-1]) / 2).square().sum()) for u in motions)
+    return math.sqrt(speed / max(away, 1e-30))
 
 
 # (done, total) updates, the rollouts' beginnings and their number of frames

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gausim.core import DivergenceError, Forces, Frame, Hands, SimState, Trajectory, roll_out
 from gausim.models.reference.reference import hand_motion
+from gausim.models.rollout.amplitude_guard import AmplitudeGuard
 from gausim.models.rollout.cuda_graph import GraphedStep
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
@@ -134,10 +135,14 @@ class SceneStepper:
 
         graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and not moves and not model.history
         self._step = GraphedStep(step, batch.rest) if graphed else step
-        self._guard: EnergyGuard | None = None
+        self._guard: EnergyGuard | AmplitudeGuard | None = None
         # Gravity, impacts and hands change the energy of a body that is not in fixed pins.
-        if model.rollout.energy_guard_frames and model.knows_energy and not moves:
-            self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
+        if model.rollout.energy_guard_frames and not moves:
+            frequency = float(model.template.frequency(scene_id))
+            if model.knows_energy:
+                self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
+            elif frequency:
+                self._guard = AmplitudeGuard(model, prepared, self._step, frequency)
         # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)
         self._asked = 0

@@ -122,6 +122,7 @@ class GausSim(SceneModel):
             hands: poses of the hands of every member before, at and after this frame; None: all pins are at rest.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
+        began = state.positions
         state = state if force is None else self.pushed(prepared, state, force)
         # Kernels are aggregated to centres of mass of the finest units, relative to the reference that carries them.
         state = state.remembering(self.history)
@@ -135,7 +136,7 @@ class GausSim(SceneModel):
         if not self.history:
             return frame
         older = (state.previous, *state.older)[: self.history]
-        return replace(frame, state=SimState(frame.positions, state.positions, older))
+        return replace(frame, state=SimState(frame.positions, began, older))
 
     def _solve(
         self, prepared: Prepared, motion: UnitMotion, correction_scale: float, outputs: list[Tensor]

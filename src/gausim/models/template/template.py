@@ -123,6 +123,10 @@ class Template(nn.Module, ABC):
         """Prefixes of the names of a scene's parameters and buffers in the state dict, each after ``prefix``."""
         return ()
 
+    def frequency(self, scene_id: int) -> float | Tensor:
+        """Mean angular frequency of a scene's tracked motion [1 / frame], for templates without energy; 0: unknown."""
+        return 0.0
+
     @abstractmethod
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """Modes (N, 3, M) of one scene, displacement gradients (N, 3, 3, M), sizes (M,).
@@ -246,10 +250,20 @@ class RestTemplate(Template):
         self._hierarchies, self._finest = hierarchies, finest
         self._frames = frames or [np.eye(3)] * len(hierarchies)
         self._bases: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        known = (nn.Parameter(torch.zeros(()), requires_grad=False) for _ in hierarchies)  # set by the teaching
+        self.frequencies = nn.ParameterList(known)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
         return PreparedTemplate(batch)
+
+    def frequency(self, scene_id: int) -> float | Tensor:
+        """Of what :func:`gausim.training.teach.teach` was given."""
+        return self.frequencies[scene_id]
+
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """The frequency."""
+        return (f"{prefix}frequencies.{scene_id}",)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """The lowest modes of an even solid of the body's shape, of equal energy; computed when first asked for."""
