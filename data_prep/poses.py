@@ -19,12 +19,12 @@ from data_prep.capture.cameras.output import PosedWriter, key_of, sequence_camer
 from data_prep.capture.cameras.report import draw_cameras, point_colors, reprojection
 from data_prep.capture.cameras.sources import Material, Posed, Sources, from_model
 from data_prep.capture.cameras.world import WorldOptions, place
+from data_prep.common.colmap import PointTable, read_colmap
 from data_prep.common.command import add_options, chosen, headline, run_command, stage_parser
 from data_prep.common.photos import list_images, open_photo
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import DataError
-from gausim.io.colmap import PointTable, read_colmap
 from gausim.io.files import replacing
 
 # Raise when the same inputs and settings give another result than before.

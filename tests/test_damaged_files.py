@@ -15,6 +15,7 @@ import yaml
 from helpers import colmap_files, toy_object
 from helpers.plain import Call
 
+from data_prep.common.colmap import read_colmap
 from data_prep.pack import pack
 from gausim.cli.main import main
 from gausim.compose.command import quoted, with_data_directories
@@ -24,7 +25,6 @@ from gausim.core import ConfigError, DataError, GausSimError
 from gausim.data.objects import ObjectData
 from gausim.interaction.selections import Ball
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Reset, load_session, save_session
-from gausim.io.colmap import read_colmap
 from gausim.io.files import read_yaml, safe_name
 from gausim.io.npz import read_array
 from gausim.io.ply import load_masks, load_scene

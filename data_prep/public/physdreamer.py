@@ -17,13 +17,13 @@ from pathlib import Path
 
 from data_prep.capture.cameras.sources import Posed, fitted, from_model, read_lens_transforms
 from data_prep.capture.films.film import FILMS, FilmFrames
+from data_prep.common.colmap import colmap_files, find_colmap, read_colmap
 from data_prep.common.command import option
 from data_prep.common.photos import Photo, list_images, open_photo, read_picture
 from data_prep.public.fields import check_name
 from data_prep.public.scene import ImportOptions, Motion, PublicObject, flattened, pinhole
 from data_prep.ready.marks import SCENE, scene_files, write_scene
 from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap import colmap_files, find_colmap, read_colmap
 from gausim.io.files import natural
 
 BLENDER = "transforms_train.json"

@@ -17,13 +17,13 @@ from pathlib import Path
 from msgspec import Struct
 
 from data_prep.capture.cameras.sources import Posed, posed_image
+from data_prep.common.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
 from data_prep.common.command import option
 from data_prep.common.photos import find_mask, list_images, open_photo
 from data_prep.public.fields import REMEDY, read_record
 from data_prep.public.scene import ImportOptions, Motion, Picture, PublicObject, View, flattened, pinhole
 from data_prep.ready.marks import scene_files, write_scene
 from gausim.core.errors import DataError
-from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
 from gausim.io.files import natural, slashed
 from gausim.io.plain_json import checked
 

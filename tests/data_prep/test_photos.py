@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from data_prep.capture.cameras.sources import fitted
+from data_prep.common.colmap import ColmapCamera
 from data_prep.common.photos import open_photo, read_mask, read_picture, unread_in
 from gausim.core import DataError
-from gausim.io.colmap import ColmapCamera
 from gausim.io.pixels import exif_turned
 
 RGBA = np.random.default_rng(0).integers(0, 256, (6, 8, 4)).astype(np.uint8)

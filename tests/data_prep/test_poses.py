@@ -13,11 +13,11 @@ from data_prep import poses as command
 from data_prep.capture.cameras.lenses import lens, straighten
 from data_prep.capture.cameras.mapping import MappingOptions
 from data_prep.capture.cameras.sources import Sources
+from data_prep.common.colmap import ColmapCamera
 from data_prep.common.stage import read_manifest
 from data_prep.poses import WorldOptions, find_poses
 from gausim.core import ConfigError, DataError
 from gausim.data.records import SequenceRecord
-from gausim.io.colmap import ColmapCamera
 from gausim.io.transforms import read_transforms
 from gausim.ops.orbit import look_at
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from data_prep.common.colmap import ColmapCamera
 from data_prep.common.photos import premultiplied, straight
 from gausim.core.errors import DataError
-from gausim.io.colmap import ColmapCamera
 
 if TYPE_CHECKING:
     import pycolmap

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 import pycolmap
 
+from data_prep.common.colmap import PARAMETERS
 from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, reduced
 from data_prep.common.progress import Tick
 from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap import PARAMETERS
 from gausim.io.files import write_durably
 
 SEED = 0

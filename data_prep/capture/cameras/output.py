@@ -10,11 +10,11 @@ import numpy as np
 
 from data_prep.capture.cameras.lenses import Straightened, straighten
 from data_prep.capture.cameras.sources import Posed, fitted
+from data_prep.common.colmap import ColmapCamera, PointTable
 from data_prep.common.photos import Photo, check_one_size, list_images, open_photo, write_picture
 from data_prep.common.progress import Tick
 from data_prep.common.stage import write_npz
 from gausim.core.errors import DataError
-from gausim.io.colmap import ColmapCamera, PointTable
 from gausim.io.files import replacing
 
 

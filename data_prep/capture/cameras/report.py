@@ -10,7 +10,7 @@ import numpy as np
 
 from data_prep.capture.cameras.sources import Posed
 from data_prep.capture.cameras.world import centers
-from gausim.io.colmap import PointTable
+from data_prep.common.colmap import PointTable
 
 
 def reprojection(points: PointTable) -> dict[str, Any]:

@@ -12,11 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.common.command import Options, option
-from data_prep.common.photos import Photo, list_images, open_photo, unread_in
-from data_prep.common.stage import MANIFEST, read_manifest
-from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap import (
+from data_prep.common.colmap import (
     ColmapCamera,
     ColmapImage,
     ColmapModel,
@@ -26,6 +22,10 @@ from gausim.io.colmap import (
     no_points,
     read_colmap,
 )  # fmt: skip
+from data_prep.common.command import Options, option
+from data_prep.common.photos import Photo, list_images, open_photo, unread_in
+from data_prep.common.stage import MANIFEST, read_manifest
+from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import natural, slashed
 from gausim.io.pixels import SUFFIXES
 from gausim.io.plain_json import read_json

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 from helpers import colmap_files
 
+from data_prep.common.colmap import PARAMETERS, find_colmap, read_colmap
 from gausim.core import DataError
-from gausim.io.colmap import PARAMETERS, find_colmap, read_colmap
 
 WRITERS: dict[str, Callable] = {"binary": colmap_files.write_binary, "text": colmap_files.write_text}
 
