@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import torch
@@ -52,8 +52,12 @@ class Splats(NamedTuple):
         means, covars, colors, opacities = leaves = [field.detach().requires_grad_() for field in self[:4]]
         behind = self.means.new_tensor([0.1, 0.5, 0.9])
         rgb = renderer(means, covars, colors, opacities, *self[4:], background=behind).rgb
-        weights = torch.rand(rgb.shape, generator=torch.Generator().manual_seed(1)).to(rgb)
-        return torch.autograd.grad([rgb], leaves, [weights])
+        return torch.autograd.grad([rgb], leaves, [_weights(rgb.shape).to(rgb)])
+
+
+@cache
+def _weights(shape: torch.Size) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(1))
 
 
 def splats(count: int, width: int, height: int, views: int = 1, device: torch.device | str = "cpu") -> Splats:

@@ -71,8 +71,9 @@ class RolloutSettings:
         cuda_graph: on a CUDA device steps, and in training whole rollouts with their backward pass, are replayed as one
             graph (:class:`gausim.training.graphed.GraphedRollouts`); no effect on other devices.
         energy_guard_frames: number of past frames, of whose largest energy (in the template's terms) the network may
-            not exceed what damping leaves (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template
-            without energy: no limit.
+            not exceed what damping leaves (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0: no limit. Of a
+            taught network without such an energy it is that of an oscillator
+            (:class:`gausim.models.rollout.amplitude_guard.AmplitudeGuard`).
     """
 
     cuda_graph: bool = False
