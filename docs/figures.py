@@ -63,6 +63,30 @@ def paper_schedule() -> None:
     save(figure, "paper_schedule")
 
 
+def training_curves() -> None:
+    """Error in unseen frames over the processor time of the training, an object per panel."""
+    pivot = Pivot(load_results(DOCS / "results" / "curves.json"))
+    objects = list(dict.fromkeys(name.split(", ")[0] for name in pivot.results.objects))
+    figure, grid = plt.subplots(2, -(-len(objects) // 2), figsize=(9.6, 4.2), layout="constrained")
+    for axes, name in zip(grid.flat, objects, strict=False):
+        longest = sorted(
+            (n for n in pivot.results.objects if n.startswith(f"{name}, ")), key=lambda n: int(n.split()[1])
+        )
+        for curve, color in zip(longest, ("tab:orange", "tab:blue"), strict=False):
+            found = [
+                (float(row.split(" | ")[1]), pivot.number(row, (curve, "", "", "error_unseen")))
+                for row in pivot.rows([curve])
+            ]
+            axes.plot(*zip(*found, strict=True), color=color, marker="o", ms=2, label=curve.split(", ")[1])
+        axes.set(title=name, xlabel="processor time [s]", ylim=(0, None), xlim=(0, None))
+    for axes in list(grid.flat)[len(objects) :]:
+        axes.axis("off")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("relative to static")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    save(figure, "training_curves")
+
+
 def save(figure: plt.Figure, name: str) -> None:
     """Writes ``docs/images/NAME.svg``."""
     figure.savefig(DOCS / "images" / f"{name}.svg", metadata={"Date": None})
@@ -72,3 +96,4 @@ def save(figure: plt.Figure, name: str) -> None:
 if __name__ == "__main__":
     frames_ahead()
     paper_schedule()
+    training_curves()

@@ -72,7 +72,9 @@ class GausSim(SceneModel):
         self.shape_bodies(self.template.solid)
         self.history = features.history
         if self.history and not all(scene.surroundings.still for scene in scenes):
-            raise ConfigError("model.simulator.features.history: expected 0 where bodies are free or in hands.")
+            raise ConfigError(
+                "model.simulator.features.history: expected 0 where bodies are free or in hands. Set it to 0."
+            )
         self.predictor = DeformationPredictor(
             features=features.of(scenes), network=network, head=head, edges=hierarchy.edges,
             conserve_mass=conserve_mass,
