@@ -13,8 +13,9 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
 
-# Part of the energy that a body at least loses in a frame.
-LOSS = 0.005
+# Part of the energy that a body at least loses in a frame, and factor on the energy of the initial state as the first
+# limit: that of the oscillator rises and falls by as much between frames that are alike.
+LOSS, HEADROOM = 0.005, 1.5
 
 
 class AmplitudeGuard:
@@ -47,7 +48,7 @@ class AmplitudeGuard:
     def step(self, state: SimState, force: Tensor | None) -> Frame:
         """The next frame; the work done by a force raises the limit."""
         if not self._last:
-            self._last.append(self._energy(state))
+            self._last.append(HEADROOM * self._energy(state))
         work = 0.0
         if force is not None:
             # A shift of x_t within its frame adds twice as much to the velocity.
