@@ -32,7 +32,7 @@ def cosine(part: float) -> float:
 
 
 @pytest.mark.parametrize(("overrides", "data", "epochs", "steps", "factors"), [
-    (["model=gausim"], HELD, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5), 29: cosine(29 / 30)}),
+    (["model=gausim"], HELD, 10, {0: 15, 9: 15}, {0: 0.05, 5: cosine(0.5), 9: cosine(0.9)}),
     (["model=gausim"], FREE, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5)}),
     (["model=gausim"], COLD, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
     (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),

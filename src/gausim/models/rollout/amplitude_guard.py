@@ -13,8 +13,8 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
 
-# Part of the energy that a body at least loses in a frame, and factor on the energy of the initial state as the first
-# limit: that of the oscillator rises and falls by as much between frames that are alike.
+# Part of the energy that a body at least loses in a frame. The first limit over the energy of the initial state: the
+# oscillator knows the energy of a body only roughly.
 LOSS, HEADROOM = 0.005, 1.5
 
 
