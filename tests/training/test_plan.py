@@ -33,10 +33,10 @@ def cosine(part: float) -> float:
 
 @pytest.mark.parametrize(("overrides", "data", "epochs", "steps", "factors"), [
     (["model=gausim"], HELD, 10, {0: 15, 9: 15}, {0: 0.05, 5: cosine(0.5), 9: cosine(0.9)}),
-    (["model=gausim"], FREE, 30, {0: 15, 29: 15}, {0: 0.05, 15: cosine(0.5)}),
+    (["model=gausim"], FREE, 10, {0: 15, 9: 15}, {0: 0.05, 5: cosine(0.5)}),
     (["model=gausim"], COLD, 60, {0: 2, 1: 3, 12: 14, 13: 15, 59: 15}, {0: 0.05, 30: cosine(0.5)}),
     (["model=gausim", "plan.epochs=200"], HELD, 200, {0: 15, 199: 15}, {100: cosine(0.5)}),
-    (["model=gausim", "plan.t_start=3"], HELD, 30, {0: 3, 1: 4, 12: 15}, {15: cosine(0.5)}),
+    (["model=gausim", "plan.t_start=3"], HELD, 60, {0: 3, 1: 4, 12: 15}, {30: cosine(0.5)}),
     (["model=gausim", "plan.warm_start=null"], HELD, 60, {0: 2, 13: 15}, {30: cosine(0.5)}),
     (["model=gausim_paper"], HELD, 25, {0: 1, 14: 15, 24: 15}, {0: 1, 15: 1, 16: 0.5, 18: 0.25, 24: 0.03125}),
 ])  # fmt: skip

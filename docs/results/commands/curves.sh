@@ -8,9 +8,9 @@ for name in flower_soft flower_swing pudding_soft pudding_firm; do
   gausim train data=object data.root=data/curves/$name plan.epochs=8 $fixed name=curves/${name}_8
   gausim train data=object data.root=data/curves/$name plan.epochs=30 $fixed name=curves/${name}_30
 done
-for name in jelly_fall bar_hands; do
-  gausim train data=object data.root=data/curves_moving/$name plan.epochs=30 $fixed name=curves/$name
-done
+gausim train data=object data.root=data/curves_moving/jelly_fall plan.epochs=8 $fixed name=curves/jelly_fall_8
+gausim train data=object data.root=data/curves_moving/jelly_fall plan.epochs=30 $fixed name=curves/jelly_fall_30
+gausim train data=object data.root=data/curves_moving/bar_hands plan.epochs=30 $fixed name=curves/bar_hands_30
 gausim train data=bunny data.part=development plan.epochs=8 $fixed name=curves/bunny_8
 gausim train data=bunny data.part=development plan.epochs=30 $fixed name=curves/bunny_30
 python -m benchmarks.curves outputs/curves docs/results/curves.json

@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 from gausim.core import ConfigError
 from gausim.nn.schedules import CosineSchedule, HalvingSchedule, Schedule
 
-# Epochs after a warm start or teaching, with 95 % of the gain over the static prediction; of free bodies, and where T
-# grows nevertheless; without a start. Predicted frames in the first epoch then.
-WARM_EPOCHS, FREE_EPOCHS, COLD_EPOCHS, FIRST = 10, 30, 60, 2
+# Epochs where T is largest from the beginning, with 95 % of the gain over the static prediction, and where T grows;
+# predicted frames in the first epoch then.
+WARM_EPOCHS, COLD_EPOCHS, FIRST = 10, 60, 2
 # Predicted frames to which T grows by one at an increase, and the most that are chosen for longer videos: memory and
 # time of an optimiser step grow with T.
 USUAL, LONGEST = 15, 60
@@ -101,7 +101,7 @@ class TrainingPlan:
     Null values follow from the data; :meth:`resolved` sets them, and the saved configuration of a run states them.
 
     Attributes:
-        epochs: epochs of the training; None: 10 after a warm start or teaching, 30 for free bodies, else 60.
+        epochs: epochs of the training; None: 10 where T is largest from the beginning, else 60.
         repeats: shows of each sequence per epoch.
         batch_size: sequences per optimiser step, divided among the ranks; None: a third of all, 1 to 4.
         t_start: predicted frames T in epoch 0; None: ``t_max`` after a warm start and for free bodies, of which short
@@ -161,14 +161,13 @@ class TrainingPlan:
             )
         begun = bool(warm or teach or data.free)
         t_start = self.t_start or (t_max if begun else min(FIRST, t_max))
-        usual = WARM_EPOCHS if (warm or teach) and t_start == t_max else FREE_EPOCHS
         return replace(
             self,
             warm_start=warm,
             teach=teach,
             t_max=t_max,
             t_start=t_start,
-            epochs=self.epochs or (usual if begun else COLD_EPOCHS),
+            epochs=self.epochs or (WARM_EPOCHS if begun and t_start == t_max else COLD_EPOCHS),
             batch_size=self.batch_size or max(ranks, min(4, data.sequences // 3)),
         )
 
