@@ -72,7 +72,8 @@ def training_curves() -> None:
         longest = sorted(
             (n for n in pivot.results.objects if n.startswith(f"{name}, ")), key=lambda n: int(n.split()[1])
         )
-        for curve, color in zip(longest, ("tab:orange", "tab:blue"), strict=False):
+        for curve in longest:
+            color = "tab:blue" if curve.endswith(" 30 epochs") else "tab:orange"
             found = [
                 (float(row.split(" | ")[1]), pivot.number(row, (curve, "", "", "error_unseen")))
                 for row in pivot.rows([curve])
