@@ -75,7 +75,7 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(arguments, c
     assert 0 < spent[0] < spent[1] < spent[2]
     assert evaluate.main([str(RUN)]) == 0
     table = load_results(RUN / "evaluation" / "metrics.json").table
-    found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim", "points")}
+    found = {(e.split, e.metric): e.value for e in table if (e.row, e.views) == ("gausim_paper", "points")}
     assert float(watched[-1]["error_unseen"]) == pytest.approx(found["unseen", "error_3d_ratio"], rel=1e-3)
 
 

@@ -251,7 +251,7 @@ def test_what_a_taught_network_makes_grow_dies_away_with_the_guard(monkeypatch) 
 
     push = SceneDynamics(model).masses[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     alone, driven = away(bent, 200), away(still, 40, push)
-    model.template.frequencies[0].fill_(TURN)
+    model.template.frequency(0).fill_(TURN)
     bounded, kept = away(bent, 200), away(still, 40, push)
     assert max(alone[100:]) > 5 * max(alone[:100]) and max(away(still, 40)) == 0.0
     assert max(bounded[150:]) < 0.9 * max(bounded[:50]) and max(bounded[150:]) > 0.3 * max(bounded[:50])

@@ -171,8 +171,9 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
     """
     lesson, normalisers = Lesson(learner, model, tracks, settings, seed), normalisers_of(model)
     if isinstance(model.template, RestTemplate):
-        for scene_id, known in enumerate(model.template.frequencies):
-            known.fill_(_frequency([track.moved for track in tracks if track.scene_id == scene_id]))
+        for scene_id in range(len(model.scenes)):
+            own = [track.moved for track in tracks if track.scene_id == scene_id]
+            model.template.frequency(scene_id).fill_(_frequency(own))
     model.train()
     with torch.no_grad():
         for starts in lesson.pairs():

@@ -250,16 +250,17 @@ class RestTemplate(Template):
         self._hierarchies, self._finest = hierarchies, finest
         self._frames = frames or [np.eye(3)] * len(hierarchies)
         self._bases: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
-        known = (nn.Parameter(torch.zeros(()), requires_grad=False) for _ in hierarchies)  # set by the teaching
-        self.frequencies = nn.ParameterList(known)
+        self.frequencies = nn.Module()  # of every scene, set by the teaching
+        for scene_id in range(len(hierarchies)):
+            self.frequencies.register_buffer(str(scene_id), torch.zeros(()))
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
         return PreparedTemplate(batch)
 
-    def frequency(self, scene_id: int) -> float | Tensor:
+    def frequency(self, scene_id: int) -> Tensor:
         """Of what :func:`gausim.training.teach.teach` was given."""
-        return self.frequencies[scene_id]
+        return self.frequencies.get_buffer(str(scene_id))
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """The frequency."""
