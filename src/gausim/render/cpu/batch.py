@@ -27,7 +27,7 @@ Array = NDArray[Any]
 
 # A call is divided into at least about this many tasks. A constant, not the number of threads, because the division
 # determines the order of summation, and loss gradients must not depend on the number of threads.
-TASKS = 12
+TASKS = 8
 # [tiles] Selecting a tile's kernels reads all kernels of its strip in the band: the cost is quadratic in the height.
 BAND_TILES = 8
 ALONE = WorkerPool(1)  # runs tasks in the thread that calls it
