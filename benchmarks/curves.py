@@ -16,10 +16,9 @@ from gausim.results.table import METHOD, SCHEMA, Entry, Made, Metric, ObjectInfo
 from gausim.runs import provenance
 from gausim.runs.names import CONFIG, MOTION
 
-SEEN, UNSEEN = "error_seen", "error_unseen"
 METRICS = {
-    SEEN: Metric("3D error in seen frames, relative to static", "", "low", 4),
-    UNSEEN: Metric("3D error in unseen frames, relative to static", "", "low", 4),
+    f"error_{frames}": Metric(f"3D error in {frames} frames, relative to static", "", "low", 4)
+    for frames in ("seen", "unseen")
 }
 
 
@@ -39,12 +38,10 @@ def curves(folder: Path) -> Results:
 
 def _entries(path: Path) -> Iterator[Entry]:
     config = read_yaml(path.parent / CONFIG)
+    epochs = config["plan"]["epochs"]
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
-            label, name = (
-                f"{row['epoch']} | {row['cpu_seconds']}",
-                f"{row['object']}, {config['plan']['epochs']} epochs",
-            )
+            label, name = f"{row['epoch']} | {row['cpu_seconds']}", f"{row['object']}, {epochs} epochs"
             for metric in METRICS:
                 yield Entry(label, METHOD, name, "", "", metric, config["seed"], float(row[metric]))
 

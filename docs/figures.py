@@ -69,16 +69,15 @@ def training_curves() -> None:
     objects = list(dict.fromkeys(name.split(", ")[0] for name in pivot.results.objects))
     figure, grid = plt.subplots(2, -(-len(objects) // 2), figsize=(9.6, 4.2), layout="constrained")
     for axes, name in zip(grid.flat, objects, strict=False):
-        longest = sorted(
-            (n for n in pivot.results.objects if n.startswith(f"{name}, ")), key=lambda n: int(n.split()[1])
-        )
-        for curve in longest:
-            color = "tab:blue" if curve.endswith(" 30 epochs") else "tab:orange"
+        for epochs, color in ((8, "tab:orange"), (30, "tab:blue")):
+            curve = f"{name}, {epochs} epochs"
+            if curve not in pivot.results.objects:
+                continue
             found = [
                 (float(row.split(" | ")[1]), pivot.number(row, (curve, "", "", "error_unseen")))
                 for row in pivot.rows([curve])
             ]
-            axes.plot(*zip(*found, strict=True), color=color, marker="o", ms=2, label=curve.split(", ")[1])
+            axes.plot(*zip(*found, strict=True), color=color, marker="o", ms=2, label=f"{epochs} epochs")
         axes.set(title=name, xlabel="processor time [s]", ylim=(0, None), xlim=(0, None))
     for axes in list(grid.flat)[len(objects) :]:
         axes.axis("off")

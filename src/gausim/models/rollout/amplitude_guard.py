@@ -65,12 +65,11 @@ class AmplitudeGuard:
         return frame
 
     def _scaled(self, frame: Frame, state: SimState, scale: float) -> Frame:
-        rest, one = self._prepared.batch.rest, torch.eye(3).to(frame.positions)
-        now, before = (rest + scale * (x - rest) for x in (frame.positions, frame.following(state).previous))
-        older = tuple(rest + scale * (x - rest) for x in frame.following(state).older)
+        rest, one, after = self._prepared.batch.rest, torch.eye(3).to(frame.positions), frame.following(state)
+        now, before, *older = (rest + scale * (x - rest) for x in (after.positions, after.previous, *after.older))
         gradients, rotations = (one + scale * (x - one) for x in (frame.deformation_gradients, frame.rotations))
         made = replace(frame, positions=now, deformation_gradients=gradients, rotations=polar_rotation(rotations))
-        return replace(made, state=SimState(now, before, older))
+        return replace(made, state=SimState(now, before, tuple(older)))
 
     def _energy(self, state: SimState) -> float:
         now, before = (self._prepared.mean(x) - self._prepared.rest for x in (state.positions, state.previous))

@@ -138,10 +138,9 @@ class SceneStepper:
         self._guard: EnergyGuard | AmplitudeGuard | None = None
         # Gravity, impacts and hands change the energy of a body that is not in fixed pins.
         if model.rollout.energy_guard_frames and not moves:
-            frequency = float(model.template.frequency(scene_id))
             if model.knows_energy:
                 self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
-            elif frequency:
+            elif frequency := float(model.template.frequency(scene_id)):
                 self._guard = AmplitudeGuard(model, prepared, self._step, frequency)
         # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gausim.core import Frame, SimState
 from gausim.models.rollout.cuda_graph import StepFunction
+from gausim.models.step.latest import Latest
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
@@ -49,7 +50,7 @@ class EnergyGuard:
         self._model, self._prepared, self._step = model, prepared, step
         self._last: deque[float] = deque(maxlen=model.rollout.energy_guard_frames)
         self._ceiling = ceiling
-        self._known: deque[tuple[Tensor, Tensor, float]] = deque(maxlen=4)  # energies of the latest states
+        self._energies: Latest[float] = Latest()
         self._last_frame: Frame | None = None
         self.held, self.limited = 0, 0
 
@@ -130,11 +131,5 @@ class EnergyGuard:
         return frame, self._energy(frame.following(state))
 
     def _energy(self, state: SimState) -> float:
-        x, before = state.positions, state.previous
-        for now, then, energy in self._known:
-            if now is x and then is before:
-                return energy
-        energy = float(self._model.energy(self._prepared.batch, state, self._prepared))
-        if x.device.type == "cpu":  # a graph of a GPU may write into the same tensors again
-            self._known.append((x, before, energy))
-        return energy
+        states = state.positions, state.previous
+        return self._energies.of(states, lambda: float(self._model.energy(self._prepared.batch, state, self._prepared)))

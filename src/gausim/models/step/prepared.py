@@ -1,7 +1,6 @@
 """Constants of a step, computed once for all steps between two updates of the parameters."""
 
 import warnings
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, UnitMotion, per_level, weighted_sum
 from gausim.models.reference.reference import Carried, HandMotion, Reference
 from gausim.models.step.body_frame import Frames
+from gausim.models.step.latest import Latest
 from gausim.models.step.recursion import Solved
 from gausim.models.template.template import PreparedTemplate
 from gausim.ops.deformation import apply
@@ -42,17 +42,12 @@ class Prepared:
     def mean(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """Centres of mass of the finest predicted units; without loss gradients by a sparse product on the CPU."""
         if positions.device.type == "cpu" and not torch.is_grad_enabled():
-            for known, version, mean in self._latest:
-                if known is positions and known._version == version:
-                    return mean
-            self._latest.append((positions, positions._version, self._sums @ positions))
-            return self._latest[-1][2]
+            return self._means.of((positions,), lambda: self._sums @ positions)
         return weighted_sum(positions, self.mass_fraction, self.batch.finest, self.batch.levels[-1].count)
 
     @cached_property
-    def _latest(self) -> deque[tuple[Tensor, int, Tensor]]:
-        """Positions, their version and mean: a step and its energies ask for the same ones."""
-        return deque(maxlen=4)
+    def _means(self) -> Latest[Tensor]:
+        return Latest()
 
     @cached_property
     def _sums(self) -> Float[Tensor, "N K"]:
