@@ -251,12 +251,15 @@ def test_what_a_taught_network_makes_grow_dies_away_with_the_guard(monkeypatch) 
 
     push = SceneDynamics(model).masses[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     alone, driven = away(bent, 200), away(still, 40, push)
-    model.template.frequency(0).fill_(TURN)
+    model.template.oscillator(0).copy_(torch.tensor([TURN, 0.0]))
     bounded, kept = away(bent, 200), away(still, 40, push)
+    model.template.oscillator(0)[1] = 0.02  # of the energy, per frame
+    damped = away(bent, 200)
     assert max(alone[100:]) > 5 * max(alone[:100]) and max(away(still, 40)) == 0.0
     assert max(bounded[150:]) < 0.9 * max(bounded[:50]) and max(bounded[150:]) > 0.3 * max(bounded[:50])
     assert max(kept[:8]) == pytest.approx(max(driven[:8]), rel=0.1)  # a quarter of a period after the push
     assert max(kept[20:]) <= max(kept[:20])
+    assert max(damped[150:]) == pytest.approx(max(damped[50:100]) * 0.98 ** (100 / 2), rel=0.1)
 
 
 def test_a_ceiling_bounds_what_forces_do() -> None:

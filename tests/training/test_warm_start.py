@@ -1,5 +1,6 @@
 """Starts of a training, tracked motion and teaching: what is found, and that a resumed run keeps it."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from gausim.training import modal_fit
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.plan import DataFacts, Teaching, TrainingPlan, WarmStart
 from gausim.training.stages import begin
-from gausim.training.teach import Lesson
+from gausim.training.teach import Lesson, oscillator_of
 from gausim.training.tracking import Track, track
 from gausim.training.warm_start import warm_start
 
@@ -174,9 +175,19 @@ def test_a_network_that_is_taught_an_oscillator_has_learned_its_flow(long_toy: P
     begin(module, data, module.plan, seed=0, quiet=True)
     own = torch.stack([known.moved[:16] for known in whole])
     speed, middle = own.diff(dim=1).square().sum(), ((own[:, 1:] + own[:, :-1]) / 2).square().sum()
-    assert float(module.model.template.frequency(0)) == pytest.approx(float((speed / middle).sqrt()), rel=0.05)
+    frequency, loss = module.model.template.oscillator(0).tolist()
+    assert frequency == pytest.approx(float((speed / middle).sqrt()), rel=0.05) and abs(loss) < 0.01
     module.model.eval()
     assert left() < 0.1 * untaught
+
+
+def test_the_oscillator_has_the_frequency_and_the_loss_of_the_motions() -> None:
+    fall, time = 0.03, torch.arange(16.0)  # of the amplitude, and so twice as much of the energy
+    swings = [(-fall * time).exp() * (0.5 * time).sin(), (3 * (-fall * time).exp() * (0.5 * time + 1).sin())[:12]]
+    motions = [swing[:, None, None] * torch.ones(1, 4, 3) for swing in swings]
+    frequency, loss = oscillator_of([*motions, torch.zeros(16, 4, 3)])
+    assert frequency == pytest.approx(0.5, rel=0.06)
+    assert loss == pytest.approx(1 - math.exp(-2 * fall), rel=0.12)
 
 
 def test_the_plan_leaves_teaching_out_where_motion_cannot_be_tracked() -> None:

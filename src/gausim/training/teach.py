@@ -173,7 +173,7 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
     if isinstance(model.template, RestTemplate):
         for scene_id in range(len(model.scenes)):
             own = [track.moved for track in tracks if track.scene_id == scene_id]
-            model.template.frequency(scene_id).fill_(_frequency(own))
+            model.template.oscillator(scene_id).copy_(torch.tensor(oscillator_of(own)))
     model.train()
     with torch.no_grad():
         for starts in lesson.pairs():
@@ -192,11 +192,22 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
             print(f"  roll: rollouts on the tracks leave {left:.3f} of the motion", flush=True)
 
 
-def _frequency(motions: Sequence[Float[Tensor, "F K 3"]]) -> float:
-    """Angular frequency of an oscillator with the ratio of their mean velocities and displacements [1 / frame]."""
-    speed = sum(float(u.diff(dim=0).square().sum()) for u in motions)
-    away = sum(float(((u[1:] + u[:-1]) / 2).square().sum()) for u in motions)
-    return math.sqrt(speed / max(away, 1e-30))
+def oscillator_of(motions: Sequence[Float[Tensor, "F K 3"]]) -> tuple[float, float]:
+    """Angular frequency [1 / frame] of an oscillator like the motions, and the part of its energy lost in a frame.
+
+    The frequency is the ratio of velocities and displacements, the loss that of a line through the logarithms of a
+    motion's energies, each motion weighted by its energy.
+    """
+    speeds = [u.diff(dim=0).square().sum((1, 2)).double() for u in motions]
+    places = [((u[1:] + u[:-1]) / 2).square().sum((1, 2)).double() for u in motions]
+    square = float(torch.cat(speeds).sum() / torch.cat(places).sum().clamp_min(1e-30))
+    falls = spread = 0.0
+    for speed, place in zip(speeds, places, strict=True):
+        energy = (speed + square * place).clamp_min(1e-30)
+        time = torch.arange(len(energy)).to(energy) - (len(energy) - 1) / 2
+        weight = float(energy.sum())
+        falls, spread = falls - weight * float(time @ energy.log()), spread + weight * float(time @ time)
+    return math.sqrt(square), 1 - math.exp(-falls / max(spread, 1e-30))
 
 
 # (done, total) updates, the rollouts' beginnings and their number of frames

@@ -13,36 +13,39 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
 
-# Part of the energy that a body at least loses in a frame. The first limit over the energy of the initial state: the
-# oscillator knows the energy of a body only roughly.
+# Part of the energy that a body at least loses in a frame, so that motion dies away whatever was measured. The first
+# limit over the energy of the initial state: the oscillator knows the energy of a body only roughly.
 LOSS, HEADROOM = 0.005, 1.5
 
 
 class AmplitudeGuard:
     """Keeps the motion of a body from growing where nothing drives it.
 
-    The rest state as template has no energy. That of an oscillator of the mean angular frequency w of the tracked
-    motion [1 / frame] takes its place, of units c with displacements u from rest:
+    The rest state as template has no energy. That of an oscillator takes its place, with the mean angular frequency w
+    of the tracked motion [1 / frame] and the part of its energy that it loses in a frame. Of units c with
+    displacements u from rest it is
 
         E = sum_c m_c (|u_t - u_{t-1}|^2 + w^2 |(u_t + u_{t-1}) / 2|^2)
 
-    E_t is at most the largest of the last frames, less :data:`LOSS` per frame since. Where the network exceeds this,
-    the displacements at t and t - 1 are scaled by the root of the ratio. Small motions of an elastic body add up, so
-    the scaled motion is one of the body, too.
+    E_t is at most the largest of the last frames, less the loss per frame since, at least :data:`LOSS`. Where the
+    network exceeds this, the displacements at t and t - 1 are scaled by the root of the ratio. Small motions of an
+    elastic body add up, so the scaled motion is one of the body, too.
     """
 
     limited = 0  # no ceiling reduces forces
 
-    def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, frequency: float) -> None:
+    def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, oscillator: Tensor) -> None:
         """Begins a rollout of a batch of one scene.
 
         Args:
             model: the simulator; its rollout settings give the number of the last frames.
             prepared: constants of the batch.
             step: predicts a frame.
-            frequency: w [1 / frame].
+            oscillator: w [1 / frame] and the loss (2,) (:meth:`gausim.models.template.template.Template.oscillator`).
         """
-        self._model, self._prepared, self._step, self._frequency = model, prepared, step, frequency
+        self._model, self._prepared, self._step = model, prepared, step
+        self._frequency, loss = oscillator.tolist()
+        self._left = 1 - max(LOSS, loss)  # of the energy, after a frame
         self._last: deque[float] = deque(maxlen=model.rollout.energy_guard_frames)
 
     def step(self, state: SimState, force: Tensor | None) -> Frame:
@@ -61,7 +64,7 @@ class AmplitudeGuard:
         if energy > limit:
             frame, energy = self._scaled(frame, state, math.sqrt(limit / energy)), limit
         every = [*(before + work for before in self._last), energy]
-        self._last = deque(((1 - LOSS) * before for before in every), self._last.maxlen)
+        self._last = deque((self._left * before for before in every), self._last.maxlen)
         return frame
 
     def _scaled(self, frame: Frame, state: SimState, scale: float) -> Frame:

@@ -123,9 +123,12 @@ class Template(nn.Module, ABC):
         """Prefixes of the names of a scene's parameters and buffers in the state dict, each after ``prefix``."""
         return ()
 
-    def frequency(self, scene_id: int) -> float | Tensor:
-        """Mean angular frequency of a scene's tracked motion [1 / frame], for templates without energy; 0: unknown."""
-        return 0.0
+    def oscillator(self, scene_id: int) -> Tensor:
+        """Of a scene's tracked motion, for templates without energy; zeros (2,): unknown.
+
+        Mean angular frequency [1 / frame], and the part of its energy that is lost in a frame.
+        """
+        return torch.zeros(2)
 
     @abstractmethod
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -250,21 +253,21 @@ class RestTemplate(Template):
         self._hierarchies, self._finest = hierarchies, finest
         self._frames = frames or [np.eye(3)] * len(hierarchies)
         self._bases: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
-        self.frequencies = nn.Module()  # of every scene, set by the teaching
+        self.oscillators = nn.Module()  # of every scene, set by the teaching
         for scene_id in range(len(hierarchies)):
-            self.frequencies.register_buffer(str(scene_id), torch.zeros(()))
+            self.oscillators.register_buffer(str(scene_id), torch.zeros(2))
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
         return PreparedTemplate(batch)
 
-    def frequency(self, scene_id: int) -> Tensor:
+    def oscillator(self, scene_id: int) -> Tensor:
         """Of what :func:`gausim.training.teach.teach` was given."""
-        return self.frequencies.get_buffer(str(scene_id))
+        return self.oscillators.get_buffer(str(scene_id))
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
-        """The frequency."""
-        return (f"{prefix}frequencies.{scene_id}",)
+        """The oscillator."""
+        return (f"{prefix}oscillators.{scene_id}",)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """The lowest modes of an even solid of the body's shape, of equal energy; computed when first asked for."""
