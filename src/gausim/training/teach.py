@@ -195,19 +195,27 @@ def teach(learner: Learner, model: GausSim, tracks: Sequence[Track], settings: T
 def oscillator_of(motions: Sequence[Float[Tensor, "F K 3"]]) -> tuple[float, float]:
     """Angular frequency [1 / frame] of an oscillator like the motions, and the part of its energy lost in a frame.
 
-    The frequency is the ratio of velocities and displacements, the loss that of a line through the logarithms of a
-    motion's energies, each motion weighted by its energy.
+    The frequency is the ratio of velocities and displacements. The loss is the slope of the logarithm of a motion's
+    energy: the mean over motions, weighted by their energies, less two standard errors of it; 0 of a single motion.
     """
     speeds = [u.diff(dim=0).square().sum((1, 2)).double() for u in motions]
     places = [((u[1:] + u[:-1]) / 2).square().sum((1, 2)).double() for u in motions]
     square = float(torch.cat(speeds).sum() / torch.cat(places).sum().clamp_min(1e-30))
-    falls = spread = 0.0
-    for speed, place in zip(speeds, places, strict=True):
-        energy = (speed + square * place).clamp_min(1e-30)
-        time = torch.arange(len(energy)).to(energy) - (len(energy) - 1) / 2
-        weight = float(energy.sum())
-        falls, spread = falls - weight * float(time @ energy.log()), spread + weight * float(time @ time)
-    return math.sqrt(square), 1 - math.exp(-falls / max(spread, 1e-30))
+    if len(motions) < 2:
+        return math.sqrt(square), 0.0
+    energies = [(speed + square * place).clamp_min(1e-30) for speed, place in zip(speeds, places, strict=True)]
+    slopes = torch.stack([_slope(energy.log()) for energy in energies])
+    weights = torch.stack([energy.sum() for energy in energies])
+    weights = weights / weights.sum()
+    mean = weights @ slopes
+    deviation = ((weights * (slopes - mean)).square().sum() * len(slopes) / (len(slopes) - 1)).sqrt()
+    return math.sqrt(square), 1 - math.exp(float(mean + 2 * deviation))
+
+
+def _slope(values: Float[Tensor, " F"]) -> Float[Tensor, ""]:
+    """Slope of a line through values at 0, 1, ...; of one value 0."""
+    time = torch.arange(len(values)).to(values) - (len(values) - 1) / 2
+    return time @ values / (time @ time).clamp_min(1e-30)
 
 
 # (done, total) updates, the rollouts' beginnings and their number of frames
