@@ -15,6 +15,9 @@ FURTHEST = 8
 # Correlation that a shift must reach, and its gain over no shift, of several sequences together and of one alone.
 _REACHED, _GAIN = 0.5, 0.25
 _REACHED_ALONE, _GAIN_ALONE = 0.65, 0.5
+# Largest tested shift as a fraction of the frames, of several sequences and of one alone: of the few frames that a
+# larger one leaves in common, parts of a vibration correlate by chance.
+_PART, _PART_ALONE = 0.375, 0.25
 # The energy's phase depends on the view where the object moves in a circle, so the centres of the masks have equal
 # weight if their correlation reaches this. Otherwise the shift is undetermined.
 _TELLING = 0.5
@@ -83,7 +86,7 @@ def _energy_correlation(series: Sequence[_Series], view: int, lags: dict[int, in
     for energy in (s.energy for s in series):
         z = (energy - energy.mean(0)) / (energy.std(0) + 1e-12)
         others = np.mean([np.roll(z[:, v], -lags[v]) for v in lags if v != view], axis=0)
-        found += _by_lag(z[:, view, None], others[:, None]) / len(series)
+        found += _by_lag(z[:, view, None], others[:, None], _furthest(series)) / len(series)
     return found
 
 
@@ -98,18 +101,23 @@ def _path_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]
         others = [v for v in lags if v != view]
         moved = np.concatenate([np.roll(s.middles[:, v], -lags[v], axis=0) for v in others], axis=1)
         in_space = moved @ np.linalg.pinv(np.concatenate([s.seen[v] for v in others])).T
-        found += _by_lag(s.middles[:, view], in_space @ s.seen[view].T) / len(series)
+        found += _by_lag(s.middles[:, view], in_space @ s.seen[view].T, _furthest(series)) / len(series)
     return found
 
 
-def _by_lag(own: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Correlation of two series (F, n), with the first one late by -FURTHEST to FURTHEST frames."""
+def _furthest(series: Sequence[_Series]) -> int:
+    part = _PART if len(series) > 1 else _PART_ALONE
+    return min(FURTHEST, int(part * min(len(s.middles) for s in series)))
+
+
+def _by_lag(own: np.ndarray, theirs: np.ndarray, furthest: int) -> np.ndarray:
+    """Correlation of two series (F, n), with the first one late by -FURTHEST to FURTHEST frames; 0 beyond furthest."""
     found, count = np.zeros(2 * FURTHEST + 1), len(own)
-    for i, lag in enumerate(range(-FURTHEST, FURTHEST + 1)):
+    for lag in range(-furthest, furthest + 1):
         a = own[max(0, lag) : count + min(0, lag)]
         b = theirs[max(0, -lag) : count + min(0, -lag)]
         a, b = a - a.mean(0), b - b.mean(0)
-        found[i] = (a * b).sum() / (np.sqrt((a * a).sum() * (b * b).sum()) + 1e-12)
+        found[FURTHEST + lag] = (a * b).sum() / (np.sqrt((a * a).sum() * (b * b).sum()) + 1e-12)
     return found
 
 
@@ -159,7 +167,10 @@ def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[
 def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[np.ndarray, bool]:
     """Correlation of a view with the others by lag, and whether it includes the centres of the masks."""
     energy, path = _energy_correlation(series, view, lags), _path_correlation(series, view, lags)
-    return ((energy + path) / 2, True) if path.max() >= _TELLING else (energy, False)
+    if path.max() < _TELLING:
+        return energy, False
+    # A shift that only the energy speaks for is the phase of a circle.
+    return np.where(path >= path[FURTHEST], (energy + path) / 2, 0.0), True
 
 
 def _findings(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Iterator[Finding]:
