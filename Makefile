@@ -62,8 +62,9 @@ test-types: install ## Run the default tests with every annotated type and shape
 test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	run() { $(ONE_THREAD) $(BIN)/python -m pytest -p nbmake --nbmake --nbmake-timeout=600 "$$@"; }
 	run notebooks/03_*.ipynb & third=$$!
-	run notebooks/01_*.ipynb notebooks/02_*.ipynb notebooks/04_*.ipynb
+	failed=0; run notebooks/01_*.ipynb notebooks/02_*.ipynb notebooks/04_*.ipynb || failed=1
 	wait $$third
+	exit $$failed
 
 docs: install results ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
 	$(BIN)/python -c "import material, mkdocstrings" 2>/dev/null || $(INSTALL) -e ".[docs]"
