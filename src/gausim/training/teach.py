@@ -200,7 +200,7 @@ def oscillator_of(motions: Sequence[Float[Tensor, "F K 3"]]) -> tuple[float, flo
     """
     speeds = [u.diff(dim=0).square().sum((1, 2)).double() for u in motions]
     places = [((u[1:] + u[:-1]) / 2).square().sum((1, 2)).double() for u in motions]
-    square = float(torch.cat(speeds).sum() / torch.cat(places).sum().clamp_min(1e-30))
+    square = sum(float(speed.sum()) for speed in speeds) / max(sum(float(place.sum()) for place in places), 1e-30)
     if len(motions) < 2:
         return math.sqrt(square), 0.0
     energies = [(speed + square * place).clamp_min(1e-30) for speed, place in zip(speeds, places, strict=True)]

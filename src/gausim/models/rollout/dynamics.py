@@ -140,7 +140,7 @@ class SceneStepper:
         if model.rollout.energy_guard_frames and not moves:
             if model.knows_energy:
                 self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
-            elif (oscillator := model.template.oscillator(scene_id)).any():
+            elif (oscillator := model.template.oscillator(scene_id))[0] > 0:
                 self._guard = AmplitudeGuard(model, prepared, self._step, oscillator)
         # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)

@@ -124,9 +124,9 @@ class Template(nn.Module, ABC):
         return ()
 
     def oscillator(self, scene_id: int) -> Tensor:
-        """Of a scene's tracked motion, for templates without energy; zeros (2,): unknown.
+        """Mean angular frequency [1 / frame] of a scene's tracked motion, and the part of its energy lost in a frame.
 
-        Mean angular frequency [1 / frame], and the part of its energy that is lost in a frame.
+        Of shape (2,), for templates without energy; zeros: unknown.
         """
         return torch.zeros(2)
 
