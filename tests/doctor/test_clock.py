@@ -9,47 +9,28 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
-from helpers.plain import cameras_at, plain_scene
+from helpers.swaying import SWINGS, Swaying, body, ring
+from torch import Tensor
 
-from gausim.core import Trajectory
 from gausim.data.objects import ObjectData
 from gausim.doctor.clock import find_clock_faults
 from gausim.doctor.evidence import Evidence, gather
 
-# Direction of the swing in each sequence, and the phase of the one across it.
-SWINGS = {"seq_000": (0.3, 0.0), "seq_001": (1.4, 0.9), "seq_002": (2.3, 1.7)}
 # As many frames as training sees; part of the period of the swing.
 FRAMES, OMEGA = 16, 0.45
 
 
-class Circling(toy_object.ToyObject):
-    """A trunk whose top goes round an ellipse of a width, again and again."""
+class Circling(Swaying):
+    """Its top goes round an ellipse of a width, again and again."""
 
-    width = 0.03
+    width = 0.0
 
-    def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
-        angle, phase = SWINGS[sequence]
-        t = torch.arange(frames or self.frames) * OMEGA
-        along, across = 0.12 * t.sin(), self.width * ((t + phase).sin() - math.sin(phase))
-        turned = torch.stack((math.cos(angle) * along - math.sin(angle) * across,
-                              math.sin(angle) * along + math.cos(angle) * across, 0 * t), 1)  # fmt: skip
-        moved = self.scene.means + turned[:, None] * self.scene.means[:, 2:].square()
-        identity = torch.eye(3).expand(len(t), 1, 3, 3)
-        return Trajectory(moved, identity, identity, torch.zeros(self.scene.count, dtype=torch.long), self.fps)
+    def swings(self, t: Tensor, phase: float) -> tuple[Tensor, Tensor]:
+        return 0.12 * torch.sin(OMEGA * t), self.width * (torch.sin(OMEGA * t + phase) - math.sin(phase))
 
 
 def evidence(folder: Path, width: float) -> Evidence:
-    generator = torch.Generator().manual_seed(0)
-    means = torch.cartesian_prod(torch.tensor([-0.2, 0.0, 0.2]), torch.tensor([-0.15, 0.1]), torch.linspace(0, 1.2, 7))
-    scene = plain_scene(
-        means, log_scale=math.log(0.08), opacity=4.0, sh=2 * torch.rand(len(means), 1, 3, generator=generator) - 1,
-        pinned=means[:, 2] < 0.1, name="circling",
-    )  # fmt: skip
-    places = ((0.0, 1.4), (1.5, 1.9), (-0.9, 0.8), (2.6, 1.2))
-    eyes = torch.tensor([[4 * math.sin(angle), -4 * math.cos(angle), height] for angle, height in places])
-    names = tuple(f"cam_{v}" for v in range(len(places)))
-    cameras = cameras_at(eyes, (0.1, 0.1, 0.6), focal=110.0, size=64, names=names)
-    toy = Circling(folder, scene, FRAMES + 4, FRAMES, amplitudes=dict.fromkeys(SWINGS, 1.0), cameras=cameras)
+    toy = Circling(folder, body(), FRAMES + 4, FRAMES, amplitudes=dict.fromkeys(SWINGS, 1.0), cameras=ring())
     toy.width = width
     toy_object.write_object(toy)
     data = ObjectData(folder)

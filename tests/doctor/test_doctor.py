@@ -1,7 +1,6 @@
 """`gausim doctor`: nothing to say of a good object, and the right word about every mistake that a stranger makes."""
 
 import json
-import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,51 +10,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import mistakes, toy_object
-from helpers.plain import cameras_at, edit_json, plain_scene
+from helpers.plain import edit_json
+from helpers.swaying import SWINGS, Swaying, body, ring
 
 from gausim.cli.main import main
-from gausim.core import Cameras, GaussianScene, Trajectory
 from gausim.io.ply import load_scene, save_scene
 
-SIZE, FRAMES, OMEGA = 64, 32, 0.7
-VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
-# Direction and phase of the two swings of each sequence.
-SWINGS = {"seq_000": (0.3, 0.0), "seq_001": (1.4, 0.9), "seq_002": (2.3, 1.7), "seq_003": (-0.8, 2.4)}
-
-
-class Swaying(toy_object.ToyObject):
-    """Sways about its pinned foot in two directions that come and go."""
-
-    def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
-        count = frames or self.frames
-        direction, phase = SWINGS[sequence]
-        t = torch.arange(count)
-        wave = torch.sin(OMEGA * t) * (1 + 0.6 * torch.sin(0.23 * t + phase)) * 0.12
-        cross = torch.sin(OMEGA * 1.31 * t) * 0.06
-        height = self.scene.means[:, 2] ** 2
-        shift = torch.zeros(count, self.scene.count, 3)
-        shift[:, :, 0] = (math.cos(direction) * wave - math.sin(direction) * cross)[:, None] * height
-        shift[:, :, 1] = (math.sin(direction) * wave + math.cos(direction) * cross)[:, None] * height
-        identity = torch.eye(3).expand(count, 1, 3, 3)
-        return Trajectory(self.scene.means + shift, identity, identity,
-                          torch.zeros(self.scene.count, dtype=torch.long), self.fps)  # fmt: skip
-
-
-def body() -> GaussianScene:
-    trunk = torch.cartesian_prod(torch.tensor([-0.2, 0.0, 0.2]), torch.tensor([-0.15, 0.1]), torch.linspace(0, 1.2, 7))
-    arm = torch.stack((torch.linspace(0.3, 0.9, 6), torch.linspace(0.1, 0.5, 6), torch.linspace(0.7, 1.1, 6)), 1)
-    means = torch.cat((trunk, arm))
-    generator = torch.Generator().manual_seed(0)
-    return plain_scene(
-        means, log_scale=math.log(0.08), opacity=4.0, sh=2 * torch.rand(len(means), 1, 3, generator=generator) - 1,
-        pinned=means[:, 2] < 0.1, name="swaying",
-    )  # fmt: skip
-
-
-def ring() -> Cameras:
-    places = ((0.0, 1.4), (1.5, 1.9), (-0.9, 0.8), (2.6, 1.2))
-    eyes = torch.tensor([[4 * math.sin(angle), -4 * math.cos(angle), height] for angle, height in places])
-    return cameras_at(eyes, (0.1, 0.1, 0.6), focal=110.0, size=SIZE, names=VIEWS)
+FRAMES = 32
 
 
 @pytest.fixture(scope="session")
